@@ -33,7 +33,7 @@ from vggtgeo.models.onnx.contracts import (
 )
 from vggtgeo.models.onnx.fit import Fit, at_multiples
 
-from vggtgeo.io.errors import InputError, install_hint, put_back_hint
+from vggtgeo.io.errors import InputError, install_hint, reinstall_hint
 
 _log = logging.getLogger(__name__)
 GPU_PACKAGE = "onnxruntime-gpu"
@@ -257,7 +257,7 @@ def choose_provider(provider: Provider) -> str:
         version = metadata.version(GPU_PACKAGE)
         overwritten = (
             f"{GPU_PACKAGE} {version} is installed, but its files are overwritten by those of the package onnxruntime; "
-            f"{put_back_hint(GPU_PACKAGE, version)}"
+            f"{reinstall_hint(GPU_PACKAGE, version)}"
         )
     if provider == "cuda":
         why = overwritten or f"this onnxruntime runs on the CPU only; {install_hint('gpu')}"

@@ -73,7 +73,7 @@ def test_a_level_flight_is_drawn_level_or_the_picture_says_whose_up_it_has(with_
     heights = side.lines[0].get_ydata()
     if with_truth:
         assert np.ptp(heights) < 0.1, f"a level flight rises by {np.ptp(heights):.2f} m"
-    assert ("up is that of the images" in side.get_title(loc="left")) != with_truth
+    assert ("up is the mean up of the images" in side.get_title(loc="left")) != with_truth
     turning = plots.trajectory_figure(_walk())
     assert turning.axes[1].get_title(loc="left") == "seen from the side"
 

@@ -142,7 +142,7 @@ def test_the_page_is_whole_and_needs_nothing_else(run: RecordedRun, tmp_path: Pa
         assert f"<h2>{part}</h2>" in text, part
     assert "a &lt;room&gt;" in text
     assert "frame 3 is torn &amp; skipped" in text
-    assert "simulated, and so is every number" in text
+    assert "simulated, so all numbers here are" in text
     assert f"{FRAMES} / {FRAMES}" in text
     assert len(re.findall(r"data:image/jpeg", text)) == 2 + 3 * min(4, len(run.slam.keyframes))
 

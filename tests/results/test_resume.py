@@ -21,7 +21,7 @@ import vggtgeo.results.reconstruction as reconstruction
 from vggtgeo.cli.main import make_app
 from vggtgeo.datasets.frame import Frame
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
-from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, RunSoFar, frames_kept, notice_of
+from vggtgeo.results.checkpoints import CHECKPOINT, Checkpoints, RunSoFar, frame_count_text, notice_of
 from vggtgeo.results.output_checks import unfinished_message
 from vggtgeo.results.reconstruction import RunOptions, reconstruct
 from vggtgeo.results.result import Result
@@ -103,7 +103,7 @@ def test_a_resumed_run_ends_as_an_undisturbed_one(
 ) -> None:
     """State, windows, evidence, verdict and summary are the same to the bit, but for times; oracle: the other run."""
     before = killed(monkeypatch, tmp_path / "kept", frame)
-    assert frames_kept(before.path) == f"{frame} frame{'s' * (frame > 1)}"
+    assert frame_count_text(before.path) == f"{frame} frame{'s' * (frame > 1)}"
     again = run(monkeypatch, before)
     for one, other in ((undisturbed.result.record, again.result.record), (undisturbed.evidence, again.evidence)):
         assert list(differences(one, other)) == []

@@ -34,7 +34,7 @@ def test_a_machine_without_a_screen_gets_the_file(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr("vggtgeo.viewing.target.has_screen", lambda: False)
     path = tmp_path / "runs" / "run.rrd"
-    with pytest.warns(InputWarning, match=r"there is no screen, so the recording goes to `.*run\.rrd`"):
+    with pytest.warns(InputWarning, match=r"there is no screen, so the recording is written to `.*run\.rrd`"):
         opened = open_target("spawn", "test", path)
     opened.stream.log("notes", rr.TextLog("here"))
     flush(opened.stream)

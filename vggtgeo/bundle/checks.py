@@ -218,7 +218,7 @@ def check_terms(terms: Sequence[Any], observations: Observations, keyframes: int
     terms = [term.broadcast() if isinstance(term, AbstractTerm) else term for term in terms]
     names = list(_OWN)
     for term in terms:
-        check_kind("terms", term, AbstractTerm | FlatTerm, "terms in it, such as `vggtgeo.terms.RelativePose`")
+        check_kind("terms", term, AbstractTerm | FlatTerm, "a list of terms, such as `vggtgeo.terms.RelativePose`")
         if term.name in names:
             raise InputError(
                 f"`terms` must have distinct names, got `{term.name}` twice: join their observations in one term, or "

@@ -279,7 +279,7 @@ class Problem(eqx.Module):
         """
         check_kind("terms", terms, (Terms, tuple), "a tuple of terms")
         for term in terms:
-            check_kind("terms", term, AbstractTerm, "terms in it, such as `vggtgeo.terms.PointTerm`")
+            check_kind("terms", term, AbstractTerm, "a tuple of terms, such as `vggtgeo.terms.PointTerm`")
         return eqx.tree_at(lambda problem: problem.terms, self, _as_terms(terms))
 
     @property

@@ -1,3 +1,3 @@
-"""The command line: arguments in, text out; the work is done by the library below."""
+"""The command line: parse arguments, call the library, print the results."""
 
 from vggtgeo.cli.main import main as main

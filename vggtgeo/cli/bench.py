@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def bench(
     suite: Annotated[
-        str, typer.Argument(metavar="SUITE", help="A TOML file, or a suite that comes along; `list` lists those.")
+        str, typer.Argument(metavar="SUITE", help="TOML file, or name of a suite in the package; `list` prints them.")
     ],
     output: Annotated[
         Path | None,
@@ -27,28 +27,30 @@ def bench(
         list[Path] | None,
         typer.Option(help="Folder of recordings; may be given several times.", show_default="$VGGTGEO_DATA, data"),
     ] = None,
-    sequences: Annotated[str | None, typer.Option(help="Some sequences of the suite, with commas.")] = None,
-    settings: Annotated[str | None, typer.Option(help="Some settings of the suite, with commas.")] = None,
-    seeds: Annotated[int | None, typer.Option(min=1, help="Number of seeds, in place of the suite's.")] = None,
+    sequences: Annotated[str | None, typer.Option(help="Sequences to run, separated by commas.")] = None,
+    settings: Annotated[str | None, typer.Option(help="Settings to run, separated by commas.")] = None,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Number of seeds, instead of the suite's.")] = None,
     first_seed: Annotated[int | None, typer.Option(min=0, help="First seed.")] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Of each sequence, at most.")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Processes; the processors are shared out.")] = 1,
-    timeout_minutes: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None,
-    memory_gb: Annotated[float | None, typer.Option(help="Limit of a run, in place of the suite's.")] = None,
-    retry: Annotated[bool, typer.Option(help="Run again what ended without a result.")] = False,
+    frames: Annotated[int | None, typer.Option(min=1, help="Maximum frames of each sequence.")] = None,
+    workers: Annotated[
+        int, typer.Option(min=1, help="Parallel processes; each gets an equal share of the processors.")
+    ] = 1,
+    timeout_minutes: Annotated[float | None, typer.Option(help="Limit of a run, instead of the suite's.")] = None,
+    memory_gb: Annotated[float | None, typer.Option(help="Limit of a run, instead of the suite's.")] = None,
+    retry: Annotated[bool, typer.Option(help="Repeat runs that ended without a result.")] = False,
     recordings: Annotated[
-        bool | None, typer.Option(help="A file run.rrd of each run, for Rerun.", show_default="the suite's")
+        bool | None, typer.Option(help="Write run.rrd of each run, for Rerun.", show_default="the suite's")
     ] = None,
     engine: Annotated[
         Literal["processes", "ray"], typer.Option(help="Processes of this machine, or a Ray cluster.")
     ] = "processes",
-    address: Annotated[str, typer.Option(help="Of the Ray cluster; local starts one.")] = "auto",
-    cpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 1.0,
-    gpus: Annotated[float, typer.Option(help="Of each run on the cluster.")] = 0.0,
+    address: Annotated[str, typer.Option(help="Address of the Ray cluster; local starts one.")] = "auto",
+    cpus: Annotated[float, typer.Option(help="Processors of each run on the cluster.")] = 1.0,
+    gpus: Annotated[float, typer.Option(help="GPUs of each run on the cluster.")] = 0.0,
     quiet: Annotated[bool, typer.Option(help="Print the tables only.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run a suite of sequences, settings and seeds, and write its tables and its page.
+    """Run a suite of sequences, settings and seeds, and write its tables and its report.
 
     Exit code 1: no run has a result.
     """
@@ -56,18 +58,18 @@ def bench(
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from vggtgeo.benchmark.cluster import Cluster
-    from vggtgeo.benchmark.runner import bench as run_suite  # brings JAX, which --help does without
+    from vggtgeo.benchmark.runner import bench as run_suite  # imports JAX, which would make --help slow
     from vggtgeo.benchmark.suite import load_suite, shipped
 
     if suite == "list":
         for name, title in shipped().items():
             typer.echo(f"{name:14s} {title}")
         return
-    load_suite(Path(suite))  # report errors in it before the progress bar starts
+    load_suite(Path(suite))  # to report its errors before the progress bar starts
     folder = output or Path("runs") / Path(suite).stem
     console = Console(stderr=True, quiet=quiet or as_json)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    # Without a terminal the lines of the runs suffice.
+    # Without a terminal each run prints a line instead.
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("runs", total=None)
 

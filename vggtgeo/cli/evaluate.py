@@ -17,30 +17,33 @@ if TYPE_CHECKING:
     from vggtgeo.evaluation import TrajectoryReport
 
 MAX_TIME_DIFFERENCE = 0.01
-"""Seconds; that of `vggtgeo.evaluation.association`, repeated so that `--help` does not import it."""
+"""Seconds, as in `vggtgeo.evaluation.association`; repeated here so that `--help` need not import it."""
 
 
 def evaluate(
     estimate: Annotated[Path, typer.Argument(metavar="EST", help="Trajectory (TUM, KITTI), or a run's folder.")],
     truth: Annotated[Path, typer.Argument(metavar="GT", help="Trajectory (TUM, KITTI, EuRoC), or a dataset folder.")],
-    max_dt: Annotated[float, typer.Option(min=0, help="Most seconds between matched poses.")] = MAX_TIME_DIFFERENCE,
-    delta: Annotated[float, typer.Option(min=0, help="Between the two poses of a pair, for RPE; see --unit.")] = 1.0,
+    max_dt: Annotated[float, typer.Option(min=0, help="Maximum seconds between matched poses.")] = MAX_TIME_DIFFERENCE,
+    delta: Annotated[float, typer.Option(min=0, help="Distance of the two poses of an RPE pair; see --unit.")] = 1.0,
     unit: Annotated[
-        Literal["poses", "seconds", "metres"], typer.Option(help="Of --delta: poses, seconds, or metres of true path.")
+        Literal["poses", "seconds", "metres"],
+        typer.Option(help="Unit of --delta: poses, seconds, or metres of true path."),
     ] = "poses",
-    all_pairs: Annotated[bool, typer.Option(help="Overlapping pairs for RPE, not consecutive ones.")] = False,
+    all_pairs: Annotated[
+        bool, typer.Option(help="Use all overlapping pairs for RPE, not only consecutive ones.")
+    ] = False,
     vertical: Annotated[
         Literal["x", "y", "z"], typer.Option(help="Axis of GT that points up or down, for the yaw-only alignment.")
     ] = "z",
-    time_offset: Annotated[float, typer.Option(help="Seconds to add to the times of GT (its clock is late).")] = 0.0,
+    time_offset: Annotated[float, typer.Option(help="Seconds to add to the times of GT, if its clock is late.")] = 0.0,
     estimate_offset: Annotated[
-        bool, typer.Option(help="Report the errors without the estimated offsets of clock and body, too.")
+        bool, typer.Option(help="Also print the errors after removing the estimated offsets of clock and body.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Print ATE after SE(3) and Sim(3) alignment, and RPE, of EST against GT, and constant offsets between the two.
 
-    Exit code 3: the numbers mean nothing, as the two are of different sequences, or the estimate failed.
+    Exit code 3: the errors are meaningless, since the two are of different sequences, or the estimate failed.
     """
     from vggtgeo.evaluation import comparability, estimate_offsets, evaluate_trajectory, shifted
     from vggtgeo.evaluation.alignment import AXES
@@ -59,24 +62,25 @@ def evaluate(
         explained = [offsets.message] if offsets is not None and offsets.explains else []
         for text in (*verdict.reasons, *verdict.doubts, *explained):
             warn(text)
-        rest, left = None, verdict
+        corrected, final_verdict = None, verdict
         if estimate_offset and offsets is not None:
             true = offsets.removed(found, true)
-            rest, left = evaluate_trajectory(found, true, *rules), comparability(found, true, max_dt, metric)
+            corrected = evaluate_trajectory(found, true, *rules)
+            final_verdict = comparability(found, true, max_dt, metric)
     if as_json:
         known: dict[str, Any] = {"truth_in_metres": metres, **({} if scale is None else {"estimate_scale": scale})}
         known["offsets"] = None if offsets is None else offsets.to_dict()
-        if rest is not None:
-            known["without_offsets"] = {**rest.to_dict(), "comparable": not left.reasons}
+        if corrected is not None:
+            known["without_offsets"] = {**corrected.to_dict(), "comparable": not final_verdict.reasons}
         notices = {"warnings": [*report.warnings, *map(str, warned)], "comparable": not verdict.reasons}
         typer.echo(json.dumps({**report.to_dict(), **known, **notices}, indent=2))
     else:
         print_report(report, scale, metres)
         typer.echo(f"constant offsets: {'too few poses match to estimate them' if offsets is None else offsets}")
-        if rest is not None and offsets is not None:
-            typer.echo(f"without {', '.join(offsets.significant) or 'any, as none is significant'}:")
-            print_report(rest, scale, metres)
-    if left.reasons:
+        if corrected is not None and offsets is not None:
+            typer.echo(f"without {', '.join(offsets.significant) or 'offsets (none is significant)'}:")
+            print_report(corrected, scale, metres)
+    if final_verdict.reasons:
         typer.echo("NOT COMPARABLE: these errors are meaningless, see the warnings", err=True)
         raise typer.Exit(EXIT_FAILED)
 
@@ -84,8 +88,8 @@ def evaluate(
 def print_report(report: TrajectoryReport, scale: str | None = None, metres: bool | None = True) -> None:
     """Print a table of the errors.
 
-    scale: of the estimate, as in its summary; if free, only errors after Sim(3) alignment are shown. metres: whether
-    the ground truth is in metres; if unknown (None), lengths are printed without a unit.
+    scale: of the estimate, as in its summary; for "free ..." only errors after Sim(3) alignment are printed. metres:
+    whether the ground truth is in metres; if unknown (None), lengths are printed without a unit.
     """
     import numpy as np
     from rich.console import Console
@@ -96,14 +100,14 @@ def print_report(report: TrajectoryReport, scale: str | None = None, metres: boo
     console = Console()
     console.print(
         f"{report.matched} poses matched, of {report.estimated} estimated and {report.true} true; "
-        f"{100 * report.coverage:.0f} % of the truth's duration covered; scale of the Sim(3) alignment "
+        f"{100 * report.coverage:.0f} % of the ground truth's duration covered; scale of the Sim(3) alignment "
         f"{report.sim3.alignment.scale:.4f}; RPE over {report.relative.interval}",
         soft_wrap=True,
     )
     if scale is not None:
         console.print(f"scale of the estimate: {scale}", soft_wrap=True)
     if not metres:
-        unit = "not known from its file" if metres is None else "not the metre"
+        unit = "unknown" if metres is None else "not the metre"
         console.print(f"lengths are in the unit of GT, which is {unit}", soft_wrap=True)
     # In a narrow terminal wrap numbers instead of truncating them: 4.4413e-17 is not "4.44…".
     table = Table(*(Column(name, overflow="fold") for name in ("", "RMSE", "mean", "median", "max")))

@@ -31,18 +31,18 @@ from vggtgeo.io.errors import GuessedCameraWarning, InputError, NoteWarning, one
 from vggtgeo.io.process import end_on_signals, share_heaps
 
 GC_THRESHOLD = 50_000
-"""New objects between two garbage collections: with Python's default of 700 they take some per cent of a run."""
+"""New objects between two garbage collections; with Python's default of 700 they take a few per cent of a run."""
 
 
 COMMANDS: dict[str, tuple[Callable[..., None] | typer.Typer, tuple[str, ...]]] = {
     "run": (
         run,
         (
-            "vggtgeo run clip.mp4 -o runs/clip  # RGB alone: the scale is free",
+            "vggtgeo run clip.mp4 -o runs/clip  # RGB alone: the scale is unknown",
             "vggtgeo run tum/desk -o runs/desk  # RGB-D: metric",
             "vggtgeo run tum/desk --stride 2 --no-lines --json  # an ablation",
             "vggtgeo run tum/desk -o runs/desk --rerun runs/desk/run.rrd  # for the Rerun viewer",
-            "vggtgeo run --settings runs/desk/settings.toml -o runs/again  # the same",
+            "vggtgeo run --settings runs/desk/settings.toml -o runs/again  # repeat a run",
         ),
     ),
     "demo": (demo, ("vggtgeo demo -o runs/demo --frames 60",)),
@@ -60,30 +60,30 @@ COMMANDS: dict[str, tuple[Callable[..., None] | typer.Typer, tuple[str, ...]]] =
             "vggtgeo view runs/desk  # a window",
             "vggtgeo view runs/desk --page  # the report with its 3D view, in a browser",
             "vggtgeo view runs/desk --rerun serve  # a browser, also on another machine",
-            "vggtgeo view runs/desk --rerun desk.rrd  # a file, where there is no screen",
+            "vggtgeo view runs/desk --rerun desk.rrd  # a file, for a machine without a screen",
         ),
     ),
     "export": (
         export,
         (
-            "vggtgeo export runs/desk --to colmap  # pictures, cameras, tracks: what Gaussian splatting wants",
+            "vggtgeo export runs/desk --to colmap  # images, cameras, tracks, as for Gaussian splatting",
             "vggtgeo export runs/desk --to glb -o desk  # the mesh, for any 3D viewer",
         ),
     ),
     "solve": (solve, ("vggtgeo solve problem.npz -o solution.npz --dtype float32",)),
     "simulate": (simulate, ("vggtgeo simulate office -o data/office --frames 300 --blur 0.01",)),
-    "models": (models, ("vggtgeo models list  # what each is for, its licence, and whether its file is there",)),
+    "models": (models, ("vggtgeo models list  # role, licence, and whether the file is present",)),
     "data": (
         data,
         (
             "vggtgeo data list  # benchmarks: where to get them, sizes, licences, layouts",
-            "vggtgeo data check /disk/tum/rgbd_dataset_freiburg1_desk  # what is wrong with a folder",
+            "vggtgeo data check /disk/tum/rgbd_dataset_freiburg1_desk  # check a folder",
         ),
     ),
     "bench": (
         bench,
         (
-            "vggtgeo bench list  # suites that come along",
+            "vggtgeo bench list  # suites in the package",
             "vggtgeo bench quick --data ~/data  # a first look, in minutes",
             "vggtgeo bench paper --workers 2 -o runs/paper  # the paper's tables, simulated; resumes",
             "vggtgeo bench mine.toml --data /disk/tum --data /disk/7scenes",
@@ -94,31 +94,31 @@ COMMANDS: dict[str, tuple[Callable[..., None] | typer.Typer, tuple[str, ...]]] =
 START = (
     "vggtgeo demo  # a simulated office, results in runs/demo",
     "vggtgeo run PATH -o runs/mine  # a video or a folder of images",
-    "vggtgeo evaluate runs/mine PATH  # errors, where the truth is known",
+    "vggtgeo evaluate runs/mine PATH  # errors, if PATH has ground truth",
     "vggtgeo COMMAND --help  # examples of each command",
 )
 EXIT_CODES = (
-    f"0 done; {EXIT_INPUT} something given is wrong (one line says what, and what to do); {EXIT_FAILED} the verdict "
-    f"of a run is failed (its outputs are kept), or what evaluate prints means nothing; {EXIT_INTERRUPTED} "
-    f"interrupted (a run writes what it has first); {EXIT_INTERNAL} a fault of the program (`vggtgeo --debug ...` "
-    "shows where)."
+    f"0 success; {EXIT_INPUT} invalid input (one line says what, and what to do); {EXIT_FAILED} the verdict of a run "
+    f"is failed (its outputs are written), or the errors that evaluate prints are meaningless; {EXIT_INTERRUPTED} "
+    f"interrupted (a run writes its results so far); {EXIT_INTERNAL} internal error (`vggtgeo --debug ...` shows the "
+    "traceback)."
 )
 
 
 class _Program(TyperGroup):
-    """Reports any error in one line."""
+    """Group of commands that reports any error in one line."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if any(not word or (word.startswith("-") and word.endswith("=")) for word in args):
-            _leave(
-                InputError("an argument is empty, which would mean this folder; is a variable of the shell not set?")
+            _exit_with_error(
+                InputError("an argument is empty, which would mean the current folder; is a shell variable not set?")
             )
         try:
-            return super().parse_args(ctx, [_at_home(word) for word in args])
+            return super().parse_args(ctx, [_with_home_expanded(word) for word in args])
         except Exception as error:
             if not _is_usage_error(error):
                 raise
-            _leave(error)
+            _exit_with_error(error)
 
     def invoke(self, ctx: Any) -> Any:
         try:
@@ -126,33 +126,33 @@ class _Program(TyperGroup):
         except (typer.Exit, typer.Abort, BrokenPipeError):
             raise
         except (Exception, KeyboardInterrupt) as error:
-            if ctx.params.get("debug") or _is_call_for_help(error):
+            if ctx.params.get("debug") or _shows_help(error):
                 raise
-            _leave(error, " ".join(filter(None, (ctx.command_path, ctx.invoked_subcommand))))
+            _exit_with_error(error, " ".join(filter(None, (ctx.command_path, ctx.invoked_subcommand))))
 
 
-def _at_home(word: str) -> str:
-    """Expand `~` where a shell does not: in quotes, and in `--output=~/runs`."""
+def _with_home_expanded(word: str) -> str:
+    """Expand `~` in quotes and in `--output=~/runs`, where shells do not expand it."""
     option, equals, value = word.partition("=") if word.startswith("-") else ("", "", word)
     return option + equals + os.path.expanduser(value)
 
 
 def _examples(calls: tuple[str, ...]) -> str:
-    """Return text for the end of a help page; blank lines keep typer from joining the lines."""
+    """Return text for the end of a help page; without blank lines typer would join the lines."""
     return "\n\n".join(("Examples:", *(f"  {call}" for call in calls)))
 
 
-def _is_call_for_help(error: BaseException) -> bool:
+def _shows_help(error: BaseException) -> bool:
     """Return whether typer shows the help page because arguments are missing."""
     return type(error).__name__ == "NoArgsIsHelpError"
 
 
 def _is_usage_error(error: BaseException) -> bool:
     """Return whether the command line is invalid, for example by an unknown option."""
-    return callable(getattr(error, "format_message", None)) and not _is_call_for_help(error)
+    return callable(getattr(error, "format_message", None)) and not _shows_help(error)
 
 
-def _leave(error: BaseException, command: str = "vggtgeo") -> NoReturn:
+def _exit_with_error(error: BaseException, command: str = "vggtgeo") -> NoReturn:
     """End the program with one line on stderr. command: for the hint to its help."""
     if isinstance(error, KeyboardInterrupt):
         message, code = "interrupted", EXIT_INTERRUPTED
@@ -163,7 +163,7 @@ def _leave(error: BaseException, command: str = "vggtgeo") -> NoReturn:
     elif _is_usage_error(error):
         message, code = f"error: {_usage_message(error, command)}", EXIT_INPUT
     else:
-        message = f"internal error: {type(error).__name__}: {error} (where: `vggtgeo --debug ...`)"
+        message = f"internal error: {type(error).__name__}: {error} (`vggtgeo --debug ...` shows the traceback)"
         code = EXIT_INTERNAL
     typer.echo(one_line(message), err=True)
     raise typer.Exit(code) from None
@@ -182,7 +182,7 @@ def _usage_message(error: Any, command: str) -> str:
 
 
 def _version(asked: bool) -> bool:
-    """Print the version of the package, and end."""
+    """Print the version of the package and exit."""
     if asked:
         typer.echo(f"vggtgeo {importlib.metadata.version('vggtgeo')}")
         raise typer.Exit
@@ -217,7 +217,7 @@ def make_app() -> typer.Typer:
 
 
 def set_jax_flags() -> None:
-    """Set environment variables, which JAX reads on import; those of the user take precedence."""
+    """Set environment variables that JAX reads on import; the user's values have priority."""
     for name, value in jax_environment().items():
         os.environ.setdefault(name, value)
 
@@ -227,18 +227,18 @@ def main() -> None:
     share_heaps()
     gc.set_threshold(GC_THRESHOLD)
     set_jax_flags()
-    os.environ["MPLBACKEND"] = "agg"  # figures go to files; an unknown backend in the environment would end a run
+    os.environ["MPLBACKEND"] = "agg"  # figures are files; an unknown backend in the environment would stop a run
     end_on_signals()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # not the stream of a notebook
-            stream.reconfigure(errors="replace")  # `?` for characters that it cannot encode
+            stream.reconfigure(errors="replace")  # print `?` for characters that it cannot encode
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # no messages about its cache folder
     warnings.showwarning = _one_line_warnings(warnings.showwarning)
     make_app()(prog_name="vggtgeo")
 
 
 def _one_line_warnings(show_others: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that shows `UserWarning`s in one line, and others as before."""
+    """Return a function that prints a `UserWarning` in one line, and others as before."""
 
     def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
         if issubclass(category, UserWarning):

@@ -1,4 +1,4 @@
-"""`vggtgeo models`: the network files of the perception roles.
+"""`vggtgeo models`: manage the network files of the perception roles.
 
 Heavy modules are imported inside functions, so that `--help` is fast.
 """
@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
 Folder = Annotated[
     Path | None,
-    typer.Option("--models", metavar="DIR", help="Folder of the files; else VGGTGEO_MODELS, else the user's data."),
+    typer.Option(
+        "--models", metavar="DIR", help="Folder of the files; default: $VGGTGEO_MODELS, else the user's data folder."
+    ),
 ]
 Provider = Literal["auto", "cuda", "cpu"]
 
@@ -32,7 +34,7 @@ FLAGS = {
     "geometry": "--init",
     "depth": "--depth",
 }
-"""The flag of `vggtgeo run` that chooses a role, by the field of `vggtgeo.Roles`."""
+"""Flag of `vggtgeo run` that chooses the implementation of a role, by the field of `vggtgeo.Roles`."""
 
 models = typer.Typer(
     no_args_is_help=True, add_completion=False, help="List, check, fetch and export the networks of the roles."
@@ -41,7 +43,7 @@ models = typer.Typer(
 
 @models.command("list")
 def list_networks(folder: Folder = None, as_json: JsonOption = False) -> None:
-    """List the networks: role, licence, size, how to get each, and whether it is there."""
+    """List the networks: role, licence, size, how to get each, and whether the file is present."""
     from vggtgeo.io.network_files import networks_folder
     from vggtgeo.models.onnx.registry import NETWORKS
 
@@ -63,10 +65,12 @@ def list_networks(folder: Folder = None, as_json: JsonOption = False) -> None:
 
 @models.command()
 def path(
-    name: Annotated[str | None, typer.Argument(help="A network; without it, the folder.", show_default=False)] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="A network; by default the folder is printed.", show_default=False)
+    ] = None,
     folder: Folder = None,
 ) -> None:
-    """Print the folder of the networks, or where the file of NAME lies or would lie."""
+    """Print the folder of the networks, or the path of the file of NAME."""
     from vggtgeo.io.network_files import network_named, networks_folder
 
     place = networks_folder(folder)
@@ -77,7 +81,7 @@ def path(
 def fetch(
     name: Annotated[str, typer.Argument(help="A network that is published as an ONNX file.")],
     folder: Folder = None,
-    endpoint: Annotated[str | None, typer.Option(help="Address of the hub, for a mirror.")] = None,
+    endpoint: Annotated[str | None, typer.Option(help="Address of a mirror of the hub.")] = None,
 ) -> None:
     """Download the published file of NAME and check its hash."""
     from vggtgeo.io.network_files import fetch_network, network_named, networks_folder
@@ -91,17 +95,17 @@ def fetch(
 def verify(
     file: Annotated[Path, typer.Argument(help="An ONNX file.", show_default=False)],
     network: Annotated[
-        str | None, typer.Option(help="The network it should be; else what it says, or looks like.", show_default=False)
+        str | None, typer.Option(help="The expected network; by default detected from the file.", show_default=False)
     ] = None,
-    image: Annotated[Path | None, typer.Option(help="A photograph; else a rendered room is shown.")] = None,
+    image: Annotated[Path | None, typer.Option(help="A photograph; by default a rendered room.")] = None,
     against: Annotated[
-        Path | None, typer.Option(metavar="FILE.npz", help="Record of PyTorch's outputs; else FILE.parity.npz, if any.")
+        Path | None, typer.Option(metavar="FILE.npz", help="Recorded PyTorch outputs; by default FILE.parity.npz.")
     ] = None,
-    runs: Annotated[int, typer.Option(min=1, help="Timed runs.")] = 3,
-    provider: Annotated[Provider, typer.Option(help="Where it runs.")] = "auto",
+    runs: Annotated[int, typer.Option(min=1, help="Number of timed runs.")] = 3,
+    provider: Annotated[Provider, typer.Option(help="Device that it runs on.")] = "auto",
     as_json: JsonOption = False,
 ) -> None:
-    """Check FILE: contract, finite outputs on an image, latency, and parity with PyTorch where it is recorded."""
+    """Check FILE: contract, finite outputs on an image, latency, and parity with PyTorch if it is recorded."""
     from vggtgeo.cli.verify_network import faults, print_report, verify_file
 
     report = verify_file(file, network, image, against, runs, provider)
@@ -147,16 +151,16 @@ def export(
     random_weights: Annotated[bool, typer.Option(help="For tests and timing: random weights.")] = False,
     height: Annotated[int | None, typer.Option(help="Height of the input, pixels.")] = None,
     width: Annotated[int | None, typer.Option(help="Width of the input, pixels.")] = None,
-    views: Annotated[int | None, typer.Option(help="Images a window (vggt).")] = None,
+    views: Annotated[int | None, typer.Option(help="Images per window (vggt).")] = None,
     tokens: Annotated[int | None, typer.Option(help="Patches inside the network (moge2).")] = None,
-    variant: Annotated[str | None, typer.Option(help="Size of the network; a wrong one lists them.")] = None,
+    variant: Annotated[str | None, typer.Option(help="Size of the network; an invalid name prints all.")] = None,
     allow_extra_weights: Annotated[
-        bool, typer.Option(help="Leave out weights of the checkpoint that the network has no place for.")
+        bool, typer.Option(help="Ignore weights of the checkpoint that the network does not have.")
     ] = False,
-    half: Annotated[bool, typer.Option(help="Attention and perceptrons in float16.")] = False,
+    half: Annotated[bool, typer.Option(help="Compute attention and perceptrons in float16.")] = False,
     tolerance: Annotated[
         float | None,
-        typer.Option(help="Largest difference from PyTorch; 0.001, or 0.03 with --half.", show_default=False),
+        typer.Option(help="Maximum difference from PyTorch; 0.001, or 0.03 with --half.", show_default=False),
     ] = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
@@ -169,8 +173,8 @@ def export(
             typer.echo(f"{stage} ...", err=True)
 
     if (checkpoint is None) != random_weights:
-        found = "neither was given" if checkpoint is None else "both were given"
-        raise InputError(f"one of `--checkpoint` FILE and `--random-weights` is needed; {found}")
+        found = "neither" if checkpoint is None else "both"
+        raise InputError(f"one of `--checkpoint FILE` and `--random-weights` must be given, got {found}")
     recipe = recipe_of(name)
     request = recipe.request(
         *(source, checkpoint, height, width, views, tokens),

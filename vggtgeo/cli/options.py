@@ -1,6 +1,6 @@
-"""Options that several commands share, and those of `vggtgeo run` in groups, each with its help.
+"""Define the options that several commands share, and the groups of options of `vggtgeo run`.
 
-Every switch has its opposite, so that a flag can override a settings file.
+Every switch has an opposite, so that the command line can override a settings file.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from vggtgeo.io.errors import InputError
-from vggtgeo.results.output_checks import EVERY
+from vggtgeo.results.output_checks import CHECKPOINT_SECONDS
 
 EXIT_INTERNAL = 1
 EXIT_INPUT = 2
@@ -25,14 +25,14 @@ EXIT_FAILED = 3
 """The run ended with the verdict "failed"; its outputs are written."""
 EXIT_INTERRUPTED = 130
 """After Ctrl-C."""
-QuietOption = Annotated[bool, typer.Option("--quiet/--no-quiet", help="Say nothing: no progress bar, no report.")]
-JsonOption = Annotated[bool, typer.Option("--json/--no-json", help="Print one JSON object and nothing else.")]
+QuietOption = Annotated[bool, typer.Option("--quiet/--no-quiet", help="Print neither a progress bar nor a report.")]
+JsonOption = Annotated[bool, typer.Option("--json/--no-json", help="Print only one JSON object.")]
 
 
-def _beside_output(context: Any, parameter: Any, target: str | None) -> str | None:
-    """Return `target`; if a settings file puts it into its output folder, and a flag changes that folder, move it too.
+def _moved_with_output(context: Any, parameter: Any, target: str | None) -> str | None:
+    """Return `target`; if the settings file has it in the output folder, and a flag changes that folder, change both.
 
-    Else a repeated run into a new folder would overwrite the recording of the old one.
+    Otherwise a repeated run into a new folder would overwrite the recording of the old run.
     """
     source = context.get_parameter_source(parameter.name)
     old, new = (context.default_map or {}).get("output"), context.params.get("output")
@@ -57,7 +57,7 @@ RerunOption = Annotated[
     typer.Option(
         "--rerun",
         metavar="TARGET",
-        callback=_beside_output,
+        callback=_moved_with_output,
         help="Log to Rerun: spawn, serve, or a file ending with .rrd.",
     ),
 ]
@@ -70,8 +70,7 @@ ResumeOption = Annotated[
     bool | None,
     typer.Option(
         "--resume/--no-resume",
-        help="Go on with a run into this folder that was killed, or begin anew; without either, such a folder is "
-        "refused.",
+        help="Continue a killed run in this folder, or start again; without either, a killed run is an error.",
         show_default=False,
     ),
 ]
@@ -94,7 +93,7 @@ class InputOptions:
         float | None, typer.Option(help="Frames per second of a video or a folder of images, instead of the file's.")
     ] = None
     intrinsics: Annotated[str | None, typer.Option(help="fx,fy,cx,cy in pixels, instead of the folder's.")] = None
-    rgb_only: Annotated[bool, typer.Option(help="Ignore depth images: the scale stays free.")] = False
+    rgb_only: Annotated[bool, typer.Option(help="Ignore depth images: the scale is unknown.")] = False
     depth_scale: Annotated[
         float | None,
         typer.Option(help="Units per metre of depth files, instead of their layout's: 1000 is millimetres."),
@@ -103,29 +102,29 @@ class InputOptions:
 
 @dataclass(frozen=True)
 class SwitchOptions:
-    """Switches of the pipeline's settings: ablations, and the last adjustment."""
+    """Switches of the pipeline: ablations, and the last adjustment."""
 
     no_lines: Annotated[
-        bool, typer.Option("--no-lines/--use-lines", help="Leave out residuals of lines: an ablation.")
+        bool, typer.Option("--no-lines/--use-lines", help="Use no residuals of lines: an ablation.")
     ] = False
     depth_prior: Annotated[
-        bool, typer.Option(help="Depth holds the estimate; without it, it starts it only: an ablation.")
+        bool, typer.Option(help="Use depth as a prior; without it only as a start: an ablation.")
     ] = True
     no_confidence: Annotated[
-        bool, typer.Option("--no-confidence/--use-confidence", help="All matches weigh the same: an ablation.")
+        bool, typer.Option("--no-confidence/--use-confidence", help="Give all matches the same weight: an ablation.")
     ] = False
     global_adjustment: Annotated[
         bool,
         typer.Option(
             "--global/--no-global",
-            help="One adjustment of the whole map at the end; without it, the sliding window alone: an ablation.",
+            help="Adjust the whole map at the end; without it only the sliding window: an ablation.",
         ),
     ] = True
     refine_intrinsics: Annotated[
         bool | None,
         typer.Option(
             "--refine-intrinsics/--fix-intrinsics",
-            help="Whether the last adjustment may change known intrinsics; by default where the images require it.",
+            help="Whether the last adjustment may change known intrinsics; by default if the images require it.",
             show_default=False,
         ),
     ] = None
@@ -143,9 +142,9 @@ class PerceptionOptions:
     ] = "classical"
     models: Annotated[Path | None, typer.Option(help="Folder of the networks' files.")] = None
     cache: Annotated[Path | None, typer.Option(help="Folder for cached outputs of the networks.")] = None
-    provider: Annotated[Provider, typer.Option(help="Where networks run.")] = "auto"
+    provider: Annotated[Provider, typer.Option(help="Device that networks run on.")] = "auto"
     memory_limit_gb: Annotated[
-        float | None, typer.Option(help="Most GPU memory of each network, GB; has no effect on the CPU.")
+        float | None, typer.Option(help="Maximum GPU memory of each network, GB; no effect on the CPU.")
     ] = None
     points: Annotated[
         Literal["classical", "orb", "mast3r", "alike", "alike-tiny", "xfeat"] | None,
@@ -178,57 +177,53 @@ class PerceptionOptions:
 
 @dataclass(frozen=True)
 class ResultOptions:
-    """Results of the run, maps that it reads and writes, and its report."""
+    """Results of the run, maps to read and write, and its report."""
 
     dense: Annotated[
         Literal["auto", "mvs", "sensor", "network", "none"],
         typer.Option(
-            help="Depth of the dense map: mvs, from the images (also in holes of measured depth); sensor or network, "
-            "as measured; none, points alone; auto, as measured, else mvs."
+            help="Depth of the dense map: mvs (from the images, also where measured depth has holes), sensor, network, "
+            "none (points only), or auto (sensor or network, else mvs)."
         ),
     ] = "auto"
-    save_depth: Annotated[bool, typer.Option(help="Write each keyframe's dense depth.")] = False
+    save_depth: Annotated[bool, typer.Option(help="Write the dense depth of each keyframe.")] = False
     save_every_depth: Annotated[
         bool,
         typer.Option(
-            help="Write depth and picture of every frame; depth where no sensor has it: what near keyframes saw."
+            help="Write depth and image of every frame; depth that no sensor measured comes from near keyframes."
         ),
     ] = False
     assignments: AssignmentsOption = None
     rerun: RerunOption = None
     map_file: Annotated[
         Path | None,
-        typer.Option("--map", help="Map of an earlier run (`--save-map`): frames are placed in it, and extend it."),
+        typer.Option("--map", help="Map of an earlier run (`--save-map`) to localise in and extend."),
     ] = None
-    localise_only: Annotated[bool, typer.Option(help="Only place frames in the map of `--map`; it stays as it is.")] = (
-        False
-    )
-    save_map: Annotated[Path | None, typer.Option(help="File for the map, so that another run can go on in it.")] = None
+    localise_only: Annotated[bool, typer.Option(help="Localise in the map of `--map` without extending it.")] = False
+    save_map: Annotated[Path | None, typer.Option(help="File for the map, which another run can extend.")] = None
     pose_prior: Annotated[
         str | None,
         typer.Option(
             metavar="FILE|recorded",
-            help="Poses as a prior of the motion: those that came with the recording (then no ground truth), or a "
-            "file's.",
+            help="Poses to use as a motion prior: those of the recording (then it has no ground truth), or of a file.",
         ),
     ] = None
     resume: ResumeOption = None
     checkpoint_every: Annotated[
         float,
-        typer.Option(help="Seconds between two states of the run that are kept for `--resume`; 0: every frame's."),
-    ] = EVERY
+        typer.Option(help="Seconds between checkpoints for `--resume`; 0: after every frame."),
+    ] = CHECKPOINT_SECONDS
     seed: Annotated[
-        int, typer.Option(min=0, max=2**31 - 1, help="Seed of the samples that robust estimators draw.")
+        int, typer.Option(min=0, max=2**31 - 1, help="Seed of the random samples of robust estimators.")
     ] = 0
     quiet: QuietOption = False
     as_json: JsonOption = False
 
 
 def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace each parameter of `command` whose type is a dataclass by options, one per field.
+    """Replace each parameter of `command` whose type is a dataclass by options, one for each field.
 
-    The order of the options is that of the parameters and fields. A parameter that is a group needs no default: its
-    fields have theirs.
+    The options have the order of the parameters and fields, and the defaults of the fields.
     """
     hints = typing.get_type_hints(command, include_extras=True)
     groups = {name: kind for name, kind in hints.items() if isinstance(kind, type) and dataclasses.is_dataclass(kind)}
@@ -251,7 +246,7 @@ def with_option_groups(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Return (width, height) of a text like 640x480; raise InputError for anything else."""
+    """Parse a text like 640x480 as (width, height); raise InputError for anything else."""
     try:
         width, height = (int(part) for part in text.lower().split("x"))
     except ValueError:

@@ -1,4 +1,4 @@
-"""Terminal output of a run: a progress bar, or log lines if the output is not a terminal; a report at the end."""
+"""Print the progress of a run, as a bar or, without a terminal, as log lines, and a report at the end."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from vggtgeo.slam.verdict.findings import Verdict
 LOG_INTERVAL = 20.0
 """Seconds between two log lines."""
 NAME_WIDTH, BAR_WIDTH = 40, 16
-"""Characters: beside both, a count of five digits and a clock fit into 80 columns."""
-MAX_NAMED = 3
-"""Stretches of frames that the line of the verdict names."""
+"""Characters; a count of five digits and a clock next to them fit into 80 columns."""
+MAX_SEGMENTS = 3
+"""Maximum number of good segments in the line of the verdict."""
 
 
 class _Count(ProgressColumn):
-    """Frames done of how many; empty for a stage that does not count frames."""
+    """Column with the numbers of finished and of all frames; empty for a stage that does not count frames."""
 
     def render(self, task: Task) -> Text:
         if not task.fields["counts"]:
@@ -41,9 +41,9 @@ class _Count(ProgressColumn):
 
 
 class _Bars(Progress):
-    """Bars of equal layout; the state of tracking has a line of its own, so that it does not displace bars and clocks.
+    """Progress bars, and below them a line with the state of tracking, so that it does not displace bars and clocks.
 
-    state: text of that line.
+    state: text of the line.
     """
 
     state = ""
@@ -55,9 +55,9 @@ class _Bars(Progress):
 
 
 class ProgressBar(Callback):
-    """Shows the number of frames, their rate, and the state's notes; a context manager, which removes the bar.
+    """Shows the number of frames, their rate, and the notes of the run. A context manager, which removes the bar.
 
-    A pipe or a file gets log lines instead of a bar.
+    If the output is not a terminal, it prints log lines instead of a bar.
     """
 
     def __init__(self, console: Console) -> None:
@@ -86,8 +86,8 @@ class ProgressBar(Callback):
     def on_frame(self, slam: Slam, frame: Frame) -> None:
         rate = (len(slam.frames) - self._resumed) / (time.perf_counter() - self._began)
         tracking = "waiting for parallax" if slam.tracker.waiting else "tracking"
-        doing = "lost" if slam.tracker.lost else tracking
-        state = f"{rate:.1f} frames/s, {len(slam.keyframes)} keyframes, {doing}"
+        status = "lost" if slam.tracker.lost else tracking
+        state = f"{rate:.1f} frames/s, {len(slam.keyframes)} keyframes, {status}"
         self._progress.state = state
         self._progress.update(self._task, advance=1)
         if self._lines and time.perf_counter() >= self._last_line + LOG_INTERVAL:
@@ -144,22 +144,22 @@ def duration(seconds: float) -> str:
 
 
 def verdict_line(verdict: Verdict) -> str:
-    """Return the level of the verdict; if it is not good, also the frames that are."""
+    """Return the level of the verdict; if it is not good, also the longest segments of good frames."""
     good = [part for part in verdict.segments if part.level == "good"]
     if verdict.level == "good" or not good:
         return f"verdict: {verdict.level}"
-    longest = sorted(good, key=lambda part: part.start - part.end)[:MAX_NAMED]
-    named = ", ".join(f"{part.start} to {part.end}" for part in sorted(longest, key=lambda part: part.start))
-    return f"verdict: {verdict.level} (good: frames {named}{', among others' * (len(good) > MAX_NAMED)})"
+    longest = sorted(good, key=lambda part: part.start - part.end)[:MAX_SEGMENTS]
+    frames = ", ".join(f"{part.start} to {part.end}" for part in sorted(longest, key=lambda part: part.start))
+    return f"verdict: {verdict.level} (good: frames {frames}{' and others' * (len(good) > MAX_SEGMENTS)})"
 
 
 def errors_line(truth: Mapping[str, Any], free: bool) -> str:
-    """Return the line with the errors against the ground truth. free: whether the estimate's scale is free."""
+    """Return the line with the errors against the ground truth. free: whether the estimate's scale is unknown."""
     se3, sim3 = (truth[name]["rmse"] for name in ("ate_se3_m", "ate_sim3_m"))
     if not truth["in_metres"]:
-        return f"ATE {sim3:.4g} after Sim(3) alignment, in the ground truth's unit, which is not the metre"
+        return f"ATE {sim3:.4g} after Sim(3) alignment, in the unit of the ground truth, which is not the metre"
     if free:
-        return f"ATE {100 * sim3:.2f} cm after Sim(3) alignment (the scale is free)"
+        return f"ATE {100 * sim3:.2f} cm after Sim(3) alignment (the scale is unknown)"
     line = f"ATE {100 * se3:.2f} cm after SE(3), {100 * sim3:.2f} cm after Sim(3) alignment"
     scale = truth["scale"]
     other = not 1 / ABSURD_SCALE <= scale <= ABSURD_SCALE
@@ -167,9 +167,9 @@ def errors_line(truth: Mapping[str, Any], free: bool) -> str:
 
 
 def uncertainty_line(stated: Mapping[str, Any] | None, result: Result) -> str:
-    """Return the line with the standard deviations of the poses; without a scale as shares of the path's extent."""
+    """Return the line with the standard deviations of the poses; without a scale in per cent of the path's extent."""
     if stated is None:
-        return "standard deviation of poses: unknown, since there was no last adjustment or it did not determine them"
+        return "standard deviation of poses: unknown, the last adjustment was skipped or could not determine it"
     metric = "translation_m" in stated
     translation, rotation = stated["translation_m" if metric else "translation_unit"], stated["rotation_deg"]
     extent = float(np.linalg.norm(np.ptp(result.trajectory.positions, axis=0)))
@@ -193,9 +193,7 @@ def print_result(console: Console, result: Result, summary: Mapping[str, Any], f
     ]
     if "images_reduced" in summary:
         sizes = summary["images_reduced"]
-        lines[-1] += (
-            f", of the original images; {sizes['from']} pixels were reduced to {sizes['to']} for everything else"
-        )
+        lines[-1] += f" (of the original images; the run reduced {sizes['from']} pixels to {sizes['to']})"
     if summary["scale"].startswith("free"):
         lines.append(f"scale: {summary['scale']}")
     elif not verdict.metric:

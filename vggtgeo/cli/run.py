@@ -1,4 +1,4 @@
-"""`vggtgeo run`: estimate trajectory and map of a sequence; `vggtgeo demo`: of a synthetic office; `vggtgeo warm-up`.
+"""`vggtgeo run`, `demo` and `warm-up`: estimate trajectory and map, try it in a synthetic office, compile in advance.
 
 Heavy modules are imported inside functions, so that `vggtgeo run --help` is fast.
 """
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 REFINE = {None: "auto", True: "always", False: "never"}
-"""The setting behind `--refine-intrinsics`, `--fix-intrinsics`, or neither."""
+"""Setting for neither flag, `--refine-intrinsics`, and `--fix-intrinsics`."""
 DEMO_SIZE = (480, 360)
 """Pixels: large enough for a dense map, small enough to render during the run."""
 
@@ -91,7 +91,7 @@ def demo(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run in a synthetic office with exact truth, rendered on the spot."""
+    """Run in a synthetic office with exact ground truth, which is rendered first."""
     from vggtgeo.cli.run_sequence import run_and_write
     from vggtgeo.results.reconstruction import RunOptions
     from vggtgeo.simulation import simulate
@@ -99,7 +99,7 @@ def demo(
     from vggtgeo.slam.window.sliding_window import warm_up as compile_window
 
     slam_settings = pipeline_settings(settings, assignments or (), {})
-    # While the light of the scene is computed, what every window needs is compiled.
+    # Compile the adjustment of windows while the light of the scene is computed.
     with ThreadPoolExecutor(1, thread_name_prefix="compile") as pool:
         pool.submit(compile_window, slam_settings)
         sequence = simulate(scene, frames, seed, rate=10.0, size=DEMO_SIZE)
@@ -119,7 +119,7 @@ def demo(
 def warm_up(
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of the images with depth, pixels.")] = "640x480",
 ) -> None:
-    """Compile what runs with default settings need, into the cache; takes some minutes once."""
+    """Fill the JIT cache for runs with default settings; takes some minutes once."""
     width, height = parse_size(size)
 
     from vggtgeo.slam.global_map.compile_ahead import compile_before_runs
@@ -150,14 +150,14 @@ def check_map_file(file: Path) -> None:
     from vggtgeo.results.output_checks import check_can_be_written
 
     if file.is_dir():
-        raise InputError(f"`--save-map` is `{file}`, a folder; give the name of a file")
+        raise InputError(f"`--save-map` must be a file, got the folder `{file}`")
     check_can_be_written(file.parent, "--save-map")
 
 
-def mixture(named: Mapping[str, str | None], no_lines: bool, no_confidence: bool) -> dict[str, str]:
-    """Return the chosen implementation of each role; a role that is not used needs no network.
+def chosen_roles(named: Mapping[str, str | None], no_lines: bool, no_confidence: bool) -> dict[str, str]:
+    """Return the chosen implementation of each role; a disabled role is classical, so that it needs no network.
 
-    InputError if a chosen role is disabled.
+    Raises InputError if a disabled role was chosen.
     """
     disabled = {
         **({"lines": "--no-lines", "line_matches": "--no-lines"} if no_lines else {}),
@@ -165,7 +165,9 @@ def mixture(named: Mapping[str, str | None], no_lines: bool, no_confidence: bool
     }
     for role, flag in disabled.items():
         if named[role] is not None:
-            raise InputError(f"`{named[role]}` was chosen, but `{flag}` disables its role; give one of the two")
+            raise InputError(
+                f"`{named[role]}` cannot be used with `{flag}`, which disables its role; give one of the two"
+            )
     return {role: name for role, name in named.items() if name is not None} | dict.fromkeys(disabled, "classical")
 
 
@@ -174,9 +176,9 @@ def open_input(path: str | Path, given: InputOptions) -> Sequence:
     from vggtgeo.datasets import open_sequence, parse_intrinsics, with_depth_scale, with_intrinsics, without_depth
 
     with warnings.catch_warnings():
-        if given.intrinsics is not None:  # the guess is overridden
+        if given.intrinsics is not None:  # a guessed camera is replaced below
             warnings.simplefilter("ignore", GuessedCameraWarning)
-        if given.depth_scale is not None:  # the unit of the layout is overridden
+        if given.depth_scale is not None:  # the unit of the depth is replaced below
             warnings.simplefilter("ignore", UnusableDepthWarning)
         sequence = open_sequence(path, given.kind, given.fps, depth=not given.rgb_only)
     if given.depth_scale is not None:
@@ -187,13 +189,11 @@ def open_input(path: str | Path, given: InputOptions) -> Sequence:
 
 
 def make_perception(chosen: PerceptionOptions, classical: Roles, switches: SwitchOptions) -> Perception:
-    """Return the roles of a preset with the chosen replacements; warn of networks with random weights, and of an unused
-    GPU.
-    """
+    """Return the roles of a preset with the chosen replacements; warn of random weights and of an unused GPU."""
     from vggtgeo.slam.settings.presets import perception
 
     named = {role: getattr(chosen, flag.lstrip("-").replace("-", "_")) for role, flag in FLAGS.items()}
-    mixed = mixture(named, switches.no_lines, switches.no_confidence)
+    mixed = chosen_roles(named, switches.no_lines, switches.no_confidence)
     perceived = perception(
         *(chosen.preset, classical, chosen.models, chosen.cache, chosen.provider, chosen.memory_limit_gb, mixed)
     )

@@ -1,4 +1,4 @@
-"""A run with progress bar, output folder and exit code, for `vggtgeo run` and `vggtgeo demo`."""
+"""Run a sequence with progress bar, output folder and exit code, for `vggtgeo run` and `vggtgeo demo`."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.viewing.callback import RerunCallback
 from vggtgeo.viewing.target import FALLBACK_FILE, check_target, open_target
 
-EARLY_SECONDS = 60.0
-"""Between two writings of the poses so far, which take less than a second for 20,000 frames."""
+SECONDS_BETWEEN_WRITES = 60.0
+"""Time between two writings of the poses so far, each less than a second for 20,000 frames."""
 
 
 def run_and_write(
@@ -52,8 +52,8 @@ def run_and_write(
 ) -> None:
     """Run a sequence with a progress bar, write its folder, print the report, and exit with the code of the verdict.
 
-    options: those of `vggtgeo.reconstruct`, its title and checkpoints completed here. flags: effective settings by
-    flag, for `settings.toml`. source: the input, into which nothing is written.
+    options: of `vggtgeo.reconstruct`; title and checkpoints are added here. flags: effective values of the command's
+    flags, for `settings.toml`. source: input folder, which must not be the output folder.
 
     Raises:
         typer.Exit: the verdict is "failed", or the run was interrupted.
@@ -64,14 +64,14 @@ def run_and_write(
     title = (options.title or sequence.name).encode("utf-8", "replace").decode()  # a folder name need not be UTF-8
     console = Console(stderr=False, quiet=silent)
     note = lambda text: console.print(f"note: {one_line(text)}", markup=False, highlight=False, soft_wrap=True)
-    # From the first frame to the last file, a signal ends the run early; the results so far are written completely.
+    # From here to the last file a signal ends the run early, and its results so far are written completely.
     with interruption() as stop, open_run_folder(output, source, RESERVE, wanted.resume) as folder:
         replaces = (output / SUMMARY).is_file()
         if replaces:
-            note(f"the result in `{output}` is replaced at the end of this run")
+            note(f"the earlier result in `{output}` will be replaced at the end of this run")
         checkpoints = Checkpoints(folder.checkpoint, bool(wanted.resume), wanted.checkpoint_every)
         if wanted.resume and not folder.checkpoint.is_file():
-            typer.echo(f"nothing to resume in `{output}`: the run begins at its first frame", err=True)
+            typer.echo(f"`{output}` has no checkpoint: the run starts at the first frame", err=True)
         viewed, url = _rerun_callbacks(wanted.rerun, folder, title, settings.window.size)
         with ProgressBar(console) as bar:
             result = reconstruct(
@@ -80,7 +80,7 @@ def run_and_write(
                 settings,
                 known_map=None if wanted.map_file is None else load_map(wanted.map_file),
                 pose_prior=wanted.pose_prior,
-                callbacks=(bar, _EarlyFiles(folder.stage, {**flags, **changed(settings)}), *viewed),
+                callbacks=(bar, _InterimFiles(folder.stage, {**flags, **changed(settings)}), *viewed),
                 options=replace(options, title=title, checkpoints=checkpoints),
             )
             bar.on_stage("writing")
@@ -91,8 +91,8 @@ def run_and_write(
         if stop.asked and not result.summary["interrupted"]:
             typer.echo("interrupted after the last frame: all results are complete and written", err=True)
     if replaces and (output / EXPORTS).is_dir():
-        # Exports are not written by a run, and may hold a user's files: they stay.
-        note(f"`{output / EXPORTS}` is of an earlier result; `vggtgeo export` renews it")
+        # Exports are kept, since they may contain files of the user.
+        note(f"`{output / EXPORTS}` belongs to an earlier result; `vggtgeo export` writes it again")
     print_result(console, result, summary, output)
     if wanted.as_json:
         typer.echo(json.dumps(summary))
@@ -114,7 +114,7 @@ def _exit_unless_complete(result: Result) -> None:
 
 
 def _save_map(result: Result, file: Path | None) -> str:
-    """Save the map if asked for; return an error message, empty on success."""
+    """Save the map if `file` is given; return an error message, empty on success."""
     try:
         if file is not None:
             result.save_map(file)
@@ -124,7 +124,7 @@ def _save_map(result: Result, file: Path | None) -> str:
 
 
 def _reopen(sequence: Sequence, roles: Roles | Perception, settings: SlamSettings) -> Sequence | None:
-    """Reopen the frames as the run read them, with depth if the run used the sensor's; None for a stream."""
+    """Return the frames as the run read them, with depth if the run used the sensor's; None for a stream."""
     if not len(sequence):
         return None
     own = roles.roles if isinstance(roles, Perception) else roles
@@ -132,7 +132,7 @@ def _reopen(sequence: Sequence, roles: Roles | Perception, settings: SlamSetting
     return reduced(seen, settings.camera.max_pixels)
 
 
-class _EarlyFiles(Callback):
+class _InterimFiles(Callback):
     """Writes settings and poses once a minute and before the last adjustment, in case the run is killed."""
 
     def __init__(self, stage: Path, settings: Mapping[str, Any]) -> None:
@@ -141,7 +141,7 @@ class _EarlyFiles(Callback):
         self._written = time.monotonic()
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
-        if time.monotonic() - self._written > EARLY_SECONDS:
+        if time.monotonic() - self._written > SECONDS_BETWEEN_WRITES:
             self.on_adjust(slam)
 
     def on_adjust(self, slam: Slam) -> None:
@@ -155,7 +155,7 @@ def _rerun_callbacks(
 ) -> tuple[tuple[RerunCallback, ...], str | None]:
     """Return the callback that logs the run, if any, and the URL of a served recording.
 
-    A recording in the run's own folder is written to its stage.
+    A recording in the run's output folder is first written to the temporary folder of the run.
     """
     if target is None:
         return (), None

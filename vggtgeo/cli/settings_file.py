@@ -1,8 +1,8 @@
-"""Settings files: a TOML file with the flags of a command; a run writes the one it used into its folder.
+"""Read settings files: TOML files with the flags of a command; a run writes such a file into its folder.
 
 A key is the long name of a flag without dashes (`rgb-only = true`, also `no-rgb-only = false`), or the name of an
-argument (`path = "..."`). A table has settings of the pipeline (`[keyframes]`, `min_inliers = 20`), as
-`--set keyframes.min_inliers=20`. The file replaces the defaults: flags on the command line override it.
+argument (`path = "..."`). A table has settings of the pipeline: `[keyframes]` with `min_inliers = 20` is
+`--set keyframes.min_inliers=20`. The file overrides the defaults, and the command line overrides the file.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ _KINDS: dict[type, tuple[str, tuple[type, ...]]] = {
 
 @dataclass(frozen=True, eq=False)
 class SettingsInUse:
-    """The settings of the running command, from flags, file and defaults."""
+    """Settings of the running command, from command line, file and defaults."""
 
     context: Any
-    """The command's context."""
+    """Context of the command (click)."""
     tables: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """The file's tables, by the names of group and field."""
+    """Tables of the file, by the names of group and field."""
     file: Path | None = None
 
     def values(self) -> dict[str, Any]:
@@ -54,17 +54,17 @@ class SettingsInUse:
 
 
 def _use(context: Any, _: Any, path: Path | None) -> SettingsInUse:
-    """Use the file's values as defaults of the command's other parameters."""
+    """Make the values of the file the defaults of the command's other parameters."""
     if path is None or context.resilient_parsing:
         return SettingsInUse(context)
-    from vggtgeo.io.files import whole_text  # loads numpy
+    from vggtgeo.io.files import whole_text  # a slow import
 
     try:
         given = tomllib.loads(whole_text(path, errors="strict"))
     except InputError as error:
         raise InputError(f"`--settings`: {error}; give a TOML file") from None
     except ValueError as error:
-        raise InputError(f"`{path}` is not valid TOML: {error}; a line is `key = value`, text in quotes") from None
+        raise InputError(f"`{path}` is not valid TOML: {error}; write `key = value`, with text in quotes") from None
     has_pipeline = any(parameter.name == "assignments" for parameter in context.command.params)
     tables = {key: value for key, value in given.items() if has_pipeline and isinstance(value, dict)}
     flags = {key: value for key, value in given.items() if key not in tables}
@@ -80,11 +80,11 @@ SettingsOption = Annotated[
         parser=Path,
         callback=_use,
         is_eager=True,
-        help="Flags from a file, as `rgb-only = true`; a flag that is given wins over it.",
+        help="File with flags, as `rgb-only = true`; flags on the command line override it.",
     ),
 ]
-"""The option, for a command's signature. It raises InputError for an unreadable file, invalid TOML, an unknown key, or
-a value of the wrong type."""
+"""Option for the signature of a command. Raises InputError for an unreadable file, invalid TOML, an unknown key, or a
+value of the wrong type."""
 
 
 def _validated(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any]:
@@ -101,7 +101,7 @@ def _validated(path: Path, given: dict[str, Any], context: Any) -> dict[str, Any
         kinds = (hints[names[key]], *typing.get_args(hints[names[key]]))  # the second without `| None`
         wanted, accepted = next((_KINDS[kind] for kind in kinds if kind in _KINDS), ("text in quotes", (str,)))
         if not isinstance(value, accepted) or (isinstance(value, bool) and bool not in accepted):
-            raise InputError(f"`{path}`: `{key}` is {value!r:.60}; it must be {wanted}")
+            raise InputError(f"`{path}`: `{key}` must be {wanted}, got {value!r:.60}")
         plain = os.path.expanduser(value) if isinstance(value, str) else value
         found[names[key]] = plain if key in keys else not plain
     return found

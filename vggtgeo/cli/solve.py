@@ -1,4 +1,4 @@
-"""`vggtgeo solve`: a bundle-adjustment problem from a file, solved and timed."""
+"""`vggtgeo solve`: solve a bundle-adjustment problem from a file, and measure the time."""
 
 from __future__ import annotations
 
@@ -23,9 +23,11 @@ def solve(
         Path, typer.Argument(metavar="PROBLEM", help="Problem (.npz), see docs/reference/problem-file.md.")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Solution (.npz): T, k, d.")],
-    max_steps: Annotated[int, typer.Option(min=1, max=1_000_000, help="Most iterations (tried steps).")] = 50,
+    max_steps: Annotated[int, typer.Option(min=1, max=1_000_000, help="Maximum iterations (tried steps).")] = 50,
     dtype: Annotated[Literal["float64", "float32"], typer.Option(help="Precision of the solve.")] = "float64",
-    repeat: Annotated[int, typer.Option(min=1, max=100_000, help="Runs to take the median time of.")] = 1,
+    repeat: Annotated[
+        int, typer.Option(min=1, max=100_000, help="Number of solves; their median time is printed.")
+    ] = 1,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -33,7 +35,7 @@ def solve(
     from vggtgeo.results.output_checks import check_can_be_written
 
     if output.exists() and problem.exists() and output.samefile(problem):
-        raise InputError(f"`{output}` is the problem itself; give another name for the solution with `-o`")
+        raise InputError(f"`-o` must not be the problem itself, got `{output}`; give another name for the solution")
     check_can_be_written(output.parent)
     report = solve_file(problem, output, max_steps, dtype, repeat)
     if as_json:
@@ -51,8 +53,8 @@ def solve(
 def solve_file(problem: Path, output: Path, max_steps: int, dtype: str, repeat: int) -> dict[str, Any]:
     """Solve the problem in the file `problem` in precision `dtype` and write the solution to `output`.
 
-    Returns the object of `--json`: energies are `1/2 sum rho`, always computed in float64; `compile_s` is little if the
-    code was in the JIT cache; `ms_per_iteration` is the median over the repetitions, None without iterations.
+    Returns the object of `--json`: energies are `1/2 sum rho`, always computed in float64; `compile_s` is small if the
+    program was in the JIT cache; `ms_per_iteration` is the median over the solves, None without iterations.
 
     Raises:
         InputError: the file is invalid, or its initial energy is not finite (then nothing is written).
@@ -66,12 +68,14 @@ def solve_file(problem: Path, output: Path, max_steps: int, dtype: str, repeat: 
     from vggtgeo.bundle.problem_file import load_problem, save_solution
 
     exact, start, index = load_problem(problem)
-    # Load again in the precision of the solve: the loader reports values that it cannot represent by their name.
+    # Load again in the precision of the solve, since the loader reports values that it cannot represent.
     cast, cast_start, _ = (exact, start, index) if dtype == "float64" else load_problem(problem, dtype)
     energy_of = jax.jit(energy)
     initial = float(energy_of(exact, start))
     if not np.isfinite(initial):
-        raise InputError(f"the initial energy of `{problem}` is {initial}; look for NaN or infinity in its arrays")
+        raise InputError(
+            f"the initial energy of `{problem}` must be finite, got {initial}: are there NaN in its arrays?"
+        )
     solution, compile_s, run_s = timed_solve(cast, cast_start, max_steps, repeat)
     wide: State = jax.tree.map(lambda leaf: leaf.astype(jnp.float64), solution.state)
     state, iterations = replace(wide, poses=wide.poses.normalize()), int(solution.iterations)

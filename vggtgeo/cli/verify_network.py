@@ -31,7 +31,7 @@ from vggtgeo.models.onnx.vggt import VggtWindow
 
 @dataclass(frozen=True)
 class Output:
-    """Summary of an output: shape, number of values that are not finite, and range of the others."""
+    """Summary of an output: shape, number of values that are not finite, and range of the finite ones."""
 
     shape: tuple[int, ...]
     not_finite: int
@@ -43,8 +43,8 @@ class Output:
 class Report:
     """The result of a check.
 
-    Fields: inputs, shapes; parity, largest relative difference from PyTorch per output, empty without a record; limit,
-    the difference allowed for rounding; latency, s; depth_pixels, pixels with a depth that a run would use, None for a
+    Fields: inputs, shapes; parity, largest relative difference from PyTorch of each output, empty without a record;
+    limit, allowed difference; latency, s; depth_pixels, number of pixels with a depth that a run would use, None for a
     network without depth.
     """
 
@@ -66,12 +66,12 @@ def verify_file(
 ) -> Report:
     """Check one file; raise InputError if it cannot be opened, is another network, or fails while running."""
     if not file.name or file.is_dir():
-        raise InputError(f"`{file}` is a folder; give the file of a network, `NAME.onnx`")
+        raise InputError(f"`file` must be a network, `NAME.onnx`, got the folder `{file}`")
     beside = file.with_name(file.name + PARITY_SUFFIX)
     record = against or (beside if beside.is_file() else None)
     contract = None if network is None else network_named(network).contract
     session = open_session(file, contract, provider=provider)
-    # Before the image: an invalid record is found at once, but the default image takes seconds to render.
+    # First, to report an invalid record at once: the default image takes seconds to render.
     parity = _parity(session, record) if record else {}
     shown = shown_image(image)
     inputs = example_inputs(session, shown)
@@ -139,7 +139,7 @@ def shown_image(path: Path | None) -> np.ndarray:
 
 def _depth_pixels(session: Session, image: np.ndarray) -> int | None:
     if session.contract.network == "moge2":
-        height, width = image.shape[:2]  # with intrinsics, as in a run: they fix the scale of the depth
+        height, width = image.shape[:2]  # a run passes intrinsics, too, which determine the scale of the depth
         camera = Camera.guess(width, height).intrinsics
         depth = BoundedDepth(MogeDepth(session)).estimate(image, None, camera).depth
     elif session.contract.network == "vggt":
@@ -184,9 +184,9 @@ def _latency(session: Session, inputs: Mapping[str, np.ndarray], runs: int) -> f
 
 
 def _parity(session: Session, recorded: Path) -> dict[str, float]:
-    """Return max |difference| / max |PyTorch| of each recorded output; InputError for an invalid record.
+    """Return max |difference| / max |PyTorch| of each recorded output; raise InputError for an invalid record.
 
-    recorded: an `.npz` of `input.NAME` and `output.NAME` arrays, as an export writes it beside its file.
+    recorded: an `.npz` with arrays `input.NAME` and `output.NAME`, as an export writes it next to the network.
     """
     try:
         with np.load(recorded) as file:
@@ -199,7 +199,7 @@ def _parity(session: Session, recorded: Path) -> dict[str, float]:
 
 
 def _tolerance(session: Session) -> float:
-    """Return the largest difference from PyTorch that rounding explains, by the precision of the file."""
+    """Return the maximum difference from PyTorch that rounding explains, for the precision of the file."""
     types = [session.metadata.get("vggtgeo.precision", ""), *(tensor.dtype for tensor in session.inputs.values())]
     return HALF_TOLERANCE if any("float16" in name for name in types) else TOLERANCE
 

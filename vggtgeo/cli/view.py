@@ -1,4 +1,4 @@
-"""`vggtgeo view` and `vggtgeo export`: a finished run in a viewer, in a browser, or as files for other programs."""
+"""`vggtgeo view` and `vggtgeo export`: show a finished run in a viewer or browser, or export it for other programs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def view(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the run in DIR: path, map, and depth where it was saved."""
+    """Show the run in DIR: path, map, and depth if it was saved."""
     if page:
         _open_page(folder, as_json)
         return
@@ -35,7 +35,7 @@ def view(
         check_can_be_shown(folder)
     elif rerun == "spawn" and not has_screen():
         raise InputError(
-            f"there is no screen; view the recording with `rerun {recording}` on a machine that has one, or here with "
+            f"there is no screen; view the recording with `rerun {recording}` on a machine with a screen, or with "
             "`--rerun serve` in a browser"
         )
     opened = open_target(rerun, folder.resolve().name, folder / "view.rrd")
@@ -55,10 +55,10 @@ def view(
 
 
 def _open_page(folder: Path, as_json: bool) -> None:
-    """Open `report.html` in the browser; print its path, too, for machines without one."""
+    """Open `report.html` in the browser, and print its path for machines without a browser."""
     report = (folder / "report.html").resolve()
     if not report.is_file():
-        raise InputError(f"`{report}` does not exist; `vggtgeo run` and `Result.save` write it for a run in memory")
+        raise InputError(f"`{report}` does not exist; `vggtgeo run` writes it, and `Result.save` for a run in memory")
     opened = webbrowser.open(report.as_uri())
     typer.echo(json.dumps({"target": "page", "shown": str(report), "opened": opened}) if as_json else str(report))
 
@@ -83,7 +83,7 @@ def export(
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write the run in DIR for another program."""
+    """Export the run in DIR for another program."""
     check_is_run(folder)
     from vggtgeo.export import export as write
 
@@ -92,10 +92,10 @@ def export(
     if as_json:
         typer.echo(json.dumps({"folder": str(target), "format": to, **written}))
     elif not quiet:
-        typer.echo(f"{target}: {', '.join(_in_words(*item) for item in written.items())}")
+        typer.echo(f"{target}: {', '.join(_described(*item) for item in written.items())}")
 
 
-def _in_words(name: str, value: float) -> str:
+def _described(name: str, value: float) -> str:
     """Return text as `3 images`, `0.42 px mean reprojection error over points`."""
     unit = " px" if name.endswith("_px") else ""
     return f"{value:.6g}{unit} {name.removesuffix('_px').replace('_', ' ')}"

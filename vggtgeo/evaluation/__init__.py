@@ -1,4 +1,4 @@
-"""Metrics of trajectories, depth and maps: functions on arrays and trajectories, without files or printing."""
+"""Compute metrics of trajectories, depth and maps, by functions on arrays and trajectories."""
 
 from vggtgeo.evaluation.alignment import Similarity as Similarity
 from vggtgeo.evaluation.alignment import align as align

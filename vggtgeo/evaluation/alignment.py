@@ -1,7 +1,7 @@
-"""Least-squares alignment of two point sets: rigid, with scale, or yaw and position.
+"""Align two point sets by least squares: rigid, with scale, or yaw and position.
 
-`align` takes "none", "se3", "sim3" or "yaw" (heading and position, the unobservable directions of a system with
-gravity; Z. Zhang and D. Scaramuzza, IROS 2018).
+`align` accepts "none", "se3", "sim3" or "yaw". The last aligns heading and position, the unobservable directions of a
+system with gravity (Z. Zhang and D. Scaramuzza, IROS 2018).
 """
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ Alignment = Literal["none", "se3", "sim3", "yaw"]
 Axis = Literal["x", "y", "z"]
 AXES: dict[Axis, tuple[float, float, float]] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 VERTICAL = AXES["z"]
-"""Default in the world of the ground truth: z, as in EuRoC and TUM RGB-D; ARKit and KITTI have y."""
+"""Default vertical axis of the ground truth: z, as in EuRoC and TUM RGB-D; ARKit and KITTI have y."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +50,9 @@ def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], 
     With centred points, `C = target^T source / n = U D V^T` and `F = diag(1, 1, sign(det U det V))`:
     `R = U F V^T`, `s = tr(D F) / var(source)`, `t = mean(target) - s R mean(source)`.
 
-    For collinear or coincident points the rotation is not unique: one of the minimisers is returned. If all points of a
-    set coincide (a still camera) the scale is undefined and set to 1. Source: S. Umeyama, IEEE PAMI 13(4), 1991.
+    For collinear or coincident points the rotation is not unique, and one minimiser is returned. If all points of a set
+    coincide (a camera that does not move), the scale is undefined and set to 1. Source: S. Umeyama, IEEE PAMI 13(4),
+    1991.
     """
     source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
     centred = source - source_mean
@@ -73,7 +74,7 @@ def heading(
 
     With centred points s, t and the unit vector a, the sum of `t . R(theta) s` is `A cos(theta) + B sin(theta)` plus a
     constant, `A = sum t . s - (t . a)(s . a)`, `B = sum t . (a x s)`, so `theta = atan2(B, A)`. `vertical` may have any
-    length. InputError for an invalid `vertical`.
+    length. Raises InputError for an invalid `vertical`.
     """
     given = real_array("vertical", vertical, (3,))
     length = float(np.linalg.norm(given))

@@ -1,4 +1,4 @@
-"""Association of the poses of two trajectories: nearest in time, as in the `evo` package, or interpolated."""
+"""Associate the poses of two trajectories, by the nearest time as the `evo` package, or by interpolation."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -10,7 +10,7 @@ from vggtgeo.io.argument_checks import check_real
 from vggtgeo.io.errors import InputError
 
 MAX_TIME_DIFFERENCE = 0.01
-"""Largest time difference of a match, seconds; evo's default."""
+"""Maximum time difference of a match, seconds; evo's default."""
 
 
 def nearest_in_time(
@@ -36,7 +36,7 @@ def associate(
     """Match the poses of two trajectories that are at most `max_dt` seconds apart; return both, pose by pose.
 
     Each pose of the shorter trajectory is matched with the nearest of the longer one. Both results have the times of
-    the shorter trajectory. InputError if `max_dt` is negative or nothing matches.
+    the shorter trajectory. Raises InputError if `max_dt` is negative, or no poses match.
     """
     check_real("max_dt", max_dt)
     if not max_dt >= 0:
@@ -53,7 +53,7 @@ def associate(
 
 
 def spans(estimate: Trajectory, truth: Trajectory) -> str:
-    """Describe the time spans of both, seconds, for an error that they do not match."""
+    """Return text with the time spans of both trajectories, for the error that they do not match."""
     parts = []
     for name, trajectory in (("`estimate`", estimate), ("`truth`", truth)):
         times = trajectory.timestamps
@@ -70,13 +70,13 @@ class ContinuousTrajectory:
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.times = trajectory.timestamps
-        self._begin = self.times[0]  # relative times keep microseconds, which times since 1970 lose in the spline
+        self._begin = self.times[0]  # subtracted, since the spline of times since 1970 would lose microseconds
         since = self.times - self._begin
         self._positions = CubicSpline(since, trajectory.positions)
         self._rotations = RotationSpline(since, Rotation.from_matrix(trajectory.rotations))
 
     def covers(self, times: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-        """Return which times lie between two poses at most two median intervals apart: a spline is wrong in gaps."""
+        """Return which times are between two poses at most two median intervals apart: splines are wrong in gaps."""
         after = np.searchsorted(self.times, times).clip(1, len(self.times) - 1)
         gap = self.times[after] - self.times[after - 1]
         inside = (times >= self.times[0]) & (times <= self.times[-1])

@@ -1,9 +1,9 @@
 """Check that an estimate and a ground truth belong to one sequence, so that errors are meaningful.
 
-Times do not show it: most sequences begin at zero and have 30 frames per second. The ATE in metres is small for any two
-straight paths after alignment; relative to the extent of the path it is significant. So are rotations: over a tenth of
-the sequence, a correct estimate has less rotation error than the camera has motion, an unrelated one has sqrt(2) times
-as much if both move alike.
+Timestamps are not sufficient: most sequences begin at zero and have 30 frames per second. The ATE in metres is not
+sufficient either: after alignment it is small for any two straight paths. Two ratios are significant: the ATE over the
+extent of the path, and the rotation error over the rotation of the camera, both over a tenth of the sequence. For a
+correct estimate the second ratio is below 1; for an unrelated one with similar motion it is sqrt(2).
 """
 
 from dataclasses import dataclass
@@ -19,26 +19,24 @@ from vggtgeo.geometry.trajectory import Trajectory
 MIN_ROTATION = np.radians(2.0)
 """RMS rotation of the ground truth below which rotations are not compared."""
 MIN_MATCHED = 0.5
-"""Expected share of matched poses, of the shorter trajectory."""
+"""Minimum share of the shorter trajectory's poses that should match."""
 MIN_SPREAD = 0.1
-"""RMS distance of the true positions from their mean, metres, below which positions are not compared."""
+"""RMS distance of the true positions from their mean, their spread, metres; below it positions are not compared."""
 MAX_MISFIT = 0.4
-"""Of the ATE after Sim(3), as share of that spread; ground truths of different sequences differ by more."""
+"""Maximum ATE after Sim(3), as a share of the spread; ground truths of different sequences differ by more."""
 GOOD_MISFIT = 0.1
-"""Misfit below which the positions agree."""
+"""Misfit of positions below which they agree."""
 MIN_WIDTH = 0.05
-"""Spread of a path across its main direction, as share of that along it; less leaves a rotation about it free."""
+"""Minimum width of a path, as a share of its length: for a narrower one the rotation about it is undetermined."""
 MAX_LEFT = 0.5
-"""Share of an error that is left if something else explains most of it."""
+"""Maximum remaining share of an error for an explanation to count: most of the error is explained."""
 MAX_ORIENTATION_GAP = np.radians(30.0)
-"""Between orientations of trajectories whose positions agree."""
+"""Maximum angle between orientations of trajectories whose positions agree."""
 
 
 @dataclass(frozen=True)
 class Comparability:
-    """reasons: why errors of the two trajectories are meaningless, as sentences; empty if they are comparable. doubts:
-    what the user should check.
-    """
+    """Result of the check. reasons: why errors are meaningless, empty if they are meaningful. doubts: what to check."""
 
     reasons: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
@@ -49,9 +47,9 @@ def comparability(
 ) -> Comparability:
     """Check whether errors of the two trajectories are meaningful.
 
-    They are not if too few poses match for an alignment, if rotations or positions fit no better than a static camera,
-    if the inverse poses fit better, or if a metric estimate has a very different scale. InputError if no poses match
-    within `max_dt` seconds.
+    They are meaningless if too few poses match for an alignment, if rotations or positions fit no better than those of
+    a static camera, if the inverse poses fit better, or if a metric estimate has a very different scale. Raises
+    InputError if no poses match within `max_dt` seconds.
     """
     matched, reference = associate(estimate, truth, max_dt)
     reasons: list[str] = []
@@ -95,7 +93,7 @@ def comparability(
 def position_misfit(matched: Trajectory, reference: Trajectory) -> float | None:
     """Return the ATE after Sim(3) over the RMS distance of the true positions from their mean.
 
-    None if the camera hardly moves, or the poses are too few for an alignment to leave an error.
+    None if the camera hardly moves, or the poses are too few for an error after alignment.
     """
     spread = float(np.sqrt(np.mean(np.sum((reference.positions - reference.positions.mean(axis=0)) ** 2, axis=1))))
     if spread < MIN_SPREAD or len(matched) < FEW_MATCHES:
@@ -106,7 +104,7 @@ def position_misfit(matched: Trajectory, reference: Trajectory) -> float | None:
 def orientation_gap(matched: Trajectory, reference: Trajectory) -> float | None:
     """Return the median angle between orientations after Sim(3) alignment of the positions, radians.
 
-    None for a straight path, about which the rotation is free.
+    None for a straight path, about which the rotation is undetermined.
     """
     along, across, _ = np.linalg.svd(reference.positions - reference.positions.mean(axis=0), compute_uv=False)
     if across <= MIN_WIDTH * along:

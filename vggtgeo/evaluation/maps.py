@@ -1,4 +1,4 @@
-"""Errors of depth maps and point clouds; points on a mesh.
+"""Compute errors of depth maps and point clouds, and sample points on a mesh.
 
 Source of the F-score: A. Knapitsch et al., "Tanks and Temples", ACM TOG 36(4), 2017.
 """
@@ -14,8 +14,10 @@ from vggtgeo.io.errors import InputError
 
 @dataclass(frozen=True)
 class DepthError:
-    """Fields: rmse, metres; relative, the mean of |d - truth| / truth; inliers, share of pixels with
-    max(d / truth, truth / d) < 1.25; count, pixels compared. NaN if no pixel could be compared.
+    """Errors of a depth map, NaN if no pixel could be compared.
+
+    Fields: rmse, metres; relative, mean of |d - truth| / truth; inliers, share of pixels with
+    max(d / truth, truth / d) < 1.25; count, number of compared pixels.
     """
 
     rmse: float
@@ -42,7 +44,8 @@ def depth_error(depth: Float[np.ndarray, "h w"], truth: Float[np.ndarray, "h w"]
 
 @dataclass(frozen=True)
 class CloudError:
-    """Fields:
+    """Errors of a point cloud.
+
     precision: share of the estimated points with a true point within `threshold`.
     recall: share of the true points with an estimated point within `threshold`.
     f_score: their harmonic mean (0 if both are 0).
@@ -69,11 +72,11 @@ def cloud_error(
 ) -> CloudError:
     """Compare two clouds in one frame, metres, by nearest neighbours (k-d trees, O((n + m) log(n + m))).
 
-    InputError for an empty cloud.
+    Raises InputError for an empty cloud.
     """
     for name, points in (("estimate", estimate), ("truth", truth)):
         if not len(points):
-            raise InputError(f"`{name}` has no point")
+            raise InputError(f"`{name}` must have at least one point, got none")
     to_truth, _ = _tree(truth).query(estimate)
     to_estimate, _ = _tree(estimate).query(truth)
     precision, recall = float((to_truth <= threshold).mean()), float((to_estimate <= threshold).mean())
@@ -89,7 +92,7 @@ def cloud_error(
 
 
 def _tree(points: np.ndarray) -> cKDTree:
-    """Return a k-d tree without duplicates: it cannot split equal points, and each query would visit all of them."""
+    """Return a k-d tree without duplicates, which it cannot separate, so that each query would visit all of them."""
     return cKDTree(np.unique(points, axis=0))
 
 
@@ -101,15 +104,15 @@ def surface_points(mesh: Mesh, spacing: float) -> Float[np.ndarray, "k 3"]:
     """Sample points on the faces of `mesh`, uniform by area, one per square of `spacing` metres on average.
 
     A face is drawn by its area, then a point in it: with u, v uniform in [0, 1] and s = sqrt(u), the point
-    `(1 - s) a + s (1 - v) b + s v c` is uniform in the triangle (R. Osada et al., ACM TOG 21(4), 2002). InputError for
-    a mesh without area.
+    `(1 - s) a + s (1 - v) b + s v c` is uniform in the triangle (R. Osada et al., ACM TOG 21(4), 2002). Raises
+    InputError for a mesh without area.
     """
     vertices, faces = mesh
     a, b, c = (vertices[faces[:, corner]].astype(np.float64) for corner in range(3))
     areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     total = float(areas.sum())
     if not total > 0:
-        raise InputError("`mesh` has no face with an area")
+        raise InputError(f"`mesh` must have a positive area, got {total:g}")
     rng = np.random.default_rng(0)
     face = rng.choice(len(faces), max(round(total / spacing**2), 1), p=areas / total)
     s, v = np.sqrt(rng.random((len(face), 1))), rng.random((len(face), 1))

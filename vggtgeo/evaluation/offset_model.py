@@ -8,8 +8,8 @@ B of the ground truth's point in the camera frame (lever arm and rotation),
 
 Both residuals have the noise model `DriftNoise`, estimated alternately with the unknowns (D. Cochrane, G. H. Orcutt,
 JASA 44, 1949): errors of neighbouring poses are correlated, so that n poses are not n observations. Rotation and lever
-arm are a hand-eye calibration: R. Horaud, F. Dornaika, IJRR 14(3), 1995. In numpy, not by `vggtgeo.solve`: whitening is
-O(n) per column, and the second Jacobian Z is not that of any residual.
+arm are a hand-eye calibration: R. Horaud, F. Dornaika, IJRR 14(3), 1995. The solver is in numpy, not `vggtgeo.solve`,
+since whitening is O(n) per column, and the second Jacobian Z is not that of any residual.
 """
 
 from collections.abc import Callable, Iterator
@@ -30,23 +30,23 @@ from vggtgeo.geometry.trajectory import Trajectory
 _CORRELATIONS = (0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.999)
 _SHARES = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 UNKNOWNS = 14
-"""3 of A's translation, 3 of its rotation, its scale, the time offset, 3 of B's position, 3 of its rotation."""
+"""Translation (3), rotation (3) and scale of A, time offset, position (3) and rotation (3) of B."""
 TIME, LEVER, TURN = slice(7, 8), slice(8, 11), slice(11, 14)
 MAX_OFFSET = 10.0
-"""Largest time offset in the search, seconds."""
+"""Maximum time offset of the search, seconds."""
 LEVEL = 1e-3
 """Significance level of all tests of offsets."""
 _ROUNDS, _STEPS, _HALVINGS = 5, 20, 6
 _MIN_STEP = 0.1
-"""Seconds between the starts of the search, and between a pose and those its velocity is computed from: the motion of a
-hand-held camera changes little within."""
+"""Seconds between candidates of the search, and of the finite differences for velocities: the motion of a hand-held
+camera changes little within this time."""
 _MIN_SPREAD = 1e-6
-"""Of a path: that of a still camera in a file of six decimals."""
+"""Minimum spread of a path: that of a camera that does not move, in a file of six decimals."""
 _WEAK_PRIOR, _MIN_GAIN = 10.0, 4.0
 """Prior deviation of the alignment, in spreads of the path; information, in units of the prior's, of a direction that
 counts as determined."""
 _MAX_POSES, _MAX_SEARCH_POSES = 400, 100
-"""Of a fit, and in the search: correlated errors make more poses slower and hardly more accurate."""
+"""Maximum poses of a fit, and of the search: since errors are correlated, more poses hardly improve the accuracy."""
 
 
 @dataclass(frozen=True)
@@ -110,8 +110,8 @@ Noises = tuple[DriftNoise, DriftNoise]
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """rotation, translation, scale: of A. time: d, seconds. lever, turn: position (metres of the truth) and rotation of
-    B, that of the truth's point in the camera's frame.
+    """Values of all unknowns. rotation, translation, scale: of A. time: d, seconds. lever, turn: position and rotation
+    of B, that is of the ground truth's point in the camera frame; lengths are in the unit of the ground truth.
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -127,8 +127,8 @@ class Unknowns:
         rotation = Rotation.from_matrix(self.turn).as_rotvec()
         return np.concatenate([np.zeros(TIME.start), [self.time], self.lever, rotation])
 
-    def moved(self, step: Float[np.ndarray, "14"], middle: Float[np.ndarray, "3"]) -> "Unknowns":
-        """Retract by a step of all unknowns; the alignment rotates and scales about `middle` in the truth's world."""
+    def retracted(self, step: Float[np.ndarray, "14"], middle: Float[np.ndarray, "3"]) -> "Unknowns":
+        """Apply a step of all unknowns; the alignment rotates and scales about `middle` in the ground truth's world."""
         turn, growth = Rotation.from_rotvec(step[3:6]).as_matrix(), float(np.exp(step[6]))
         return Unknowns(
             turn @ self.rotation,
@@ -144,9 +144,9 @@ class Unknowns:
 class Fit:
     """The result of a fit.
 
-    Fields: unknowns, of which `free` ones are estimated; covariance, float64 [14, 14], of a step of them; determined,
-    which of them the motion determines; noise, of positions and rotations; degrees of freedom; rotation_error, RMS,
-    radians.
+    Fields: unknowns, of which those in `free` are estimated; covariance, float64 [14, 14], of a step of the unknowns;
+    determined, which of them the motion determines; noise, of positions and rotations; degrees, of freedom;
+    rotation_error, RMS, radians.
     """
 
     unknowns: Unknowns
@@ -181,13 +181,13 @@ class OffsetModel:
         self._min_sigma = 1e-6 * spread, 1e-6  # pose files have six decimals or more
 
     def matched(self, time: float) -> int:
-        """Return the number of poses that have a true one with this time offset."""
+        """Return the number of poses within the ground truth at this time offset."""
         return int(self._seen(time).sum())
 
     def search(self) -> tuple[float, int]:
         """Return the best time offset for positions and rotations, and the number of candidates.
 
-        Candidates are up to `MAX_OFFSET`, with at least half as many matched poses as the best matched one.
+        Candidates are at most `MAX_OFFSET`, and match at least half as many poses as the candidate with most matches.
         """
         step = max(float(np.median(np.diff(self._all.timestamps))), _MIN_STEP)
         count = int(MAX_OFFSET / step)
@@ -214,9 +214,9 @@ class OffsetModel:
         return self._fitted(unknowns, free, noise)
 
     def refit(self, fit: Fit, free: Bool[np.ndarray, "14"]) -> Fit:
-        """Fit the `free` unknowns, others being zero, with the noise of a `fit`."""
-        held = np.where(free, fit.unknowns.offsets, 0.0)
-        starts = [self._solved(start, free, fit.noise) for start in self._starts(float(held[7]), free)]
+        """Fit the `free` unknowns, with the others zero, and the noise of `fit`."""
+        time = float(fit.unknowns.time) if free[TIME].all() else 0.0
+        starts = [self._solved(start, free, fit.noise) for start in self._starts(time, free)]
         cost = lambda one: np.mean(self._whitened(self._residuals(one), fit.noise) ** 2)
         return self._fitted(min(starts, key=cost), free, fit.noise)
 
@@ -231,7 +231,7 @@ class OffsetModel:
         return self._truth.covers(self._times - time)
 
     def _pair(self, time: float, every: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Return poses of the estimate and of the truth at the same moments."""
+        """Return poses of the estimate and of the ground truth at the same times."""
         chosen = np.flatnonzero(self._seen(time))[::every]
         return self._all.poses[self._rows[chosen]], self._truth.poses(self._times[chosen] - time)
 
@@ -243,8 +243,8 @@ class OffsetModel:
         return float(np.log(position + self._min_sigma[0] ** 2) + np.log(rotation + self._min_sigma[1] ** 2))
 
     def _starts(self, time: float, free: np.ndarray) -> Iterator[Unknowns]:
-        """Return initial values from positions alone, and from rotations: the latter are better for a straight path or
-        a long lever arm.
+        """Return initial values from positions, and from rotations, which are better for a straight path or a long
+        lever arm.
         """
         found, true = self._pair(time)
         turned, turns = true[:, :3, :3], bool(free[TURN].all())
@@ -278,12 +278,12 @@ class OffsetModel:
             residuals = self._whitened(self._residuals(unknowns), noise)
             return float(np.mean(residuals**2)), lambda: self._step(unknowns, residuals, free, noise)
 
-        moved = lambda unknowns, step: unknowns.moved(step * self._prior * free, self._middle)
-        return gauss_newton(unknowns, evaluate, moved, steps=_STEPS, trials=_HALVINGS)
+        retract = lambda unknowns, step: unknowns.retracted(step * self._prior * free, self._middle)
+        return gauss_newton(unknowns, evaluate, retract, steps=_STEPS, trials=_HALVINGS)
 
     def _step(self, unknowns: Unknowns, residuals: np.ndarray, free: np.ndarray, noise: Noises) -> np.ndarray:
         jacobian = self._whitened(self._jacobian(unknowns), noise) * (self._prior * free)
-        # The identity, the prior's information, keeps undetermined directions where they are.
+        # The identity is the information of the prior: it keeps undetermined directions unchanged.
         normal = jacobian.T @ jacobian + np.eye(UNKNOWNS)
         size = 1.0 / np.sqrt(np.diag(normal))
         inverse = np.linalg.pinv(normal * np.outer(size, size), rcond=1e-13, hermitian=True)
@@ -322,9 +322,9 @@ class OffsetModel:
         return self._columns(unknowns, true, motion / seconds[:, None])
 
     def _columns(self, unknowns: Unknowns, body: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Return the Jacobian for poses and velocities of the truth's point.
+        """Return the Jacobian for poses and velocities of the ground truth's point.
 
-        The log's own Jacobian is taken as the identity, as for small residuals.
+        The Jacobian of the logarithm is approximated by the identity, as for small residuals.
         """
         camera = body[:, :3, :3] @ unknowns.turn.T
         arm = body[:, :3, 3] - self._middle
@@ -359,8 +359,8 @@ class OffsetModel:
     def _scaled(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return both Jacobians J and Z, whitened, in units of the prior, along a basis of the determined directions.
 
-        A direction is determined if `Z^T J` has four times the prior's information (half its standard deviation), and
-        more than two independent noises would have by chance.
+        A direction is determined if `Z^T J` has four times the information of the prior (half its standard deviation),
+        and more than two independent noises have by chance.
         """
         jacobians = self._jacobian(unknowns), self._other_jacobian(unknowns)
         own, other = (self._whitened(one, noise) * (self._prior * free) for one in jacobians)
@@ -374,24 +374,25 @@ class OffsetModel:
         """Return the solution of `Z^T r = 0` (instrumental variables, see `_covariance`), starting from that of `J^T r
         = 0`.
 
-        The latter is biased: interpolation reduces the ground truth's noise between its poses, and noisy rotations
-        shorten a lever arm.
+        The solution of `J^T r = 0` is biased: interpolation reduces the ground truth's noise between its poses, and
+        noisy rotations shorten the lever arm.
         """
         size = np.inf
         for _ in range(_STEPS):
             own, other, basis = self._scaled(unknowns, free, noise)
             residuals = self._whitened(self._residuals(unknowns), noise)
             step = -basis @ np.linalg.lstsq(other.T @ own, other.T @ residuals, rcond=None)[0]
-            moved = unknowns.moved(step * self._prior, self._middle)
-            if not np.linalg.norm(step) < 0.5 * size or self.matched(moved.time) < 2:
+            updated = unknowns.retracted(step * self._prior, self._middle)
+            if not np.linalg.norm(step) < 0.5 * size or self.matched(updated.time) < 2:
                 return unknowns
-            unknowns, size = moved, float(np.linalg.norm(step))
+            unknowns, size = updated, float(np.linalg.norm(step))
         return unknowns
 
     def _covariance(self, unknowns: Unknowns, free: np.ndarray, noise: Noises) -> tuple[np.ndarray, np.ndarray]:
-        """Return the covariance of the solution of `Z^T r = 0`: `(Z^T J)^-1 Z^T Z (Z^T J)^-T`, J and Z the Jacobians of
-        the two trajectories, whose noises are independent, so that `Z^T J` contains motion only. In undetermined
-        directions the covariance of the prior.
+        """Return the covariance of the solution of `Z^T r = 0`: `(Z^T J)^-1 Z^T Z (Z^T J)^-T`.
+
+        J and Z are the Jacobians of the two trajectories. Their noises are independent, so that `Z^T J` contains motion
+        only. In undetermined directions it is the covariance of the prior.
         """
         own, other, basis = self._scaled(unknowns, free, noise)
         gain = basis @ np.linalg.pinv(other.T @ own, rcond=1e-18)
@@ -404,10 +405,10 @@ def _mean(rotations: np.ndarray) -> np.ndarray:
 
 
 def _turn_of_steps(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the rotation of the truth's body in the camera frame, and the mean square residual, rad^2.
+    """Return the rotation of the ground truth's body in the camera frame, and the mean square residual, rad^2.
 
-    From rotation vectors between successive poses, which an alignment does not change (W. Kabsch, Acta Cryst. A 32,
-    1976).
+    It follows from the rotation vectors between successive poses, which do not depend on an alignment (W. Kabsch, Acta
+    Cryst. A 32, 1976).
     """
     camera, body = (Rotation.from_matrix(one[:-1].mT @ one[1:]).as_rotvec() for one in (found, true))
     u, _, vt = np.linalg.svd(camera.T @ body)

@@ -1,8 +1,8 @@
-"""Constant offsets between estimate and ground truth: of clocks, of the tracked point, of the axes.
+"""Estimate constant offsets between estimate and ground truth: of clocks, of the tracked point, of the axes.
 
-A motion-capture marker beside the lens, other axes, or another clock cause errors that are not the estimate's.
-`estimate_offsets` fits such offsets (`offset_model`), removes insignificant ones step by step, and compares the errors
-with and without the rest.
+A motion-capture marker next to the lens, other axes, or another clock cause errors that are not the estimator's.
+`estimate_offsets` fits such offsets (`offset_model`), discards insignificant ones step by step, and compares the errors
+with and without the significant ones.
 """
 
 from collections.abc import Iterable
@@ -39,17 +39,17 @@ class Offsets:
     """Constant offsets between a ground truth and an estimate.
 
     Fields:
-        time, time_sd: offset to add to the ground truth's times, seconds, and its standard deviation, infinite if the
-            motion does not determine it.
+        time, time_sd: offset to add to the ground truth's times, seconds, and its standard deviation. All standard
+            deviations are infinite if the motion does not determine the value.
         lever, lever_sd: float64 [3], the ground truth's point in the camera frame, in the unit of the ground truth.
         turn: float64 [3, 3], axes of the ground truth's body in the camera frame.
         turn_sd: float64 [3], radians, of a small rotation about each of the camera's axes.
-        significant: the significant ones of "time offset", "lever arm", "rotation".
+        significant: which of "time offset", "lever arm", "rotation" are significant.
         ate, ate_left: RMSE after Sim(3), in the unit of the ground truth, before and after removing the significant
-            offsets. Sim(3), since a lever arm would explain a part of a scale error.
+            offsets. Sim(3) is used since a lever arm could explain a part of a scale error.
         rotation_error, rotation_error_left: RMS rotation error, radians, before and after.
-        explains: whether the offsets explain most of the error: less than half of that of positions or rotations is
-            left, and the two are comparable.
+        explains: whether the offsets explain most of the error: less than half of the error of positions or rotations
+            remains, and the two trajectories are then comparable.
     """
 
     time: float
@@ -66,7 +66,7 @@ class Offsets:
     explains: bool = False
 
     def removed(self, estimate: Trajectory, truth: Trajectory) -> Trajectory:
-        """Return the ground truth without the significant offsets: of the camera itself, by the estimate's clock."""
+        """Return the ground truth without the significant offsets: the poses of the camera at the estimate's clock."""
         body = np.eye(4)
         if "lever arm" in self.significant:
             body[:3, 3] = self.lever
@@ -101,9 +101,9 @@ class Offsets:
     def _texts(self) -> dict[str, str]:
         turned, sds = np.degrees(self._turned), np.degrees(self.turn_sd)
         return {
-            "time offset": f"time offset of the truth {_numbers([self.time], [self.time_sd], ' s')}",
-            "lever arm": f"lever arm of the truth's point in the camera frame {_numbers(self.lever, self.lever_sd)}",
-            "rotation": f"rotation of the truth's axes in the camera frame {_numbers(turned, sds, ' deg')}",
+            "time offset": f"time offset of the ground truth {_numbers([self.time], [self.time_sd], ' s')}",
+            "lever arm": f"lever arm of the ground truth in the camera frame {_numbers(self.lever, self.lever_sd)}",
+            "rotation": f"rotation of the ground truth's axes in the camera frame {_numbers(turned, sds, ' deg')}",
         }
 
     @property
@@ -122,7 +122,7 @@ class Offsets:
 def estimate_offsets(estimate: Trajectory, truth: Trajectory, max_dt: float = MAX_TIME_DIFFERENCE) -> Offsets | None:
     """Estimate constant offsets of time, lever arm and rotation between two trajectories; None for under ten poses.
 
-    Time offsets are searched up to ten seconds. InputError if no poses match within `max_dt` seconds.
+    Time offsets are searched up to ten seconds. Raises InputError if no poses match within `max_dt` seconds.
 
     Example:
         >>> import vggtgeo as vg
@@ -171,12 +171,13 @@ def estimate_offsets(estimate: Trajectory, truth: Trajectory, max_dt: float = MA
 
 
 def _reduced(model: OffsetModel, fit: Fit, tried: int) -> tuple[Fit, tuple[str, ...]]:
-    """Remove the offsets that are not significant, the least significant first."""
+    """Discard the offsets that are not significant, one by one, the least significant first."""
     names = list(_PARTS)
     while names:
-        chances = {name: _chance(fit, _PARTS[name]) * (tried if name == "time offset" else 1) for name in names}
-        weakest = max(names, key=chances.__getitem__)
-        if chances[weakest] < LEVEL:
+        # Bonferroni's correction: the search has chosen the best of `tried` time offsets.
+        p_values = {name: _p_value(fit, _PARTS[name]) * (tried if name == "time offset" else 1) for name in names}
+        weakest = max(names, key=p_values.__getitem__)
+        if p_values[weakest] < LEVEL:
             break
         names.remove(weakest)
         fit = model.refit(fit, _with(fit.free, weakest, False))
@@ -189,19 +190,19 @@ def _with(free: np.ndarray, name: str, wanted: bool = True) -> np.ndarray:
     return found
 
 
-def _chance(fit: Fit, part: slice) -> float:
+def _p_value(fit: Fit, part: slice) -> float:
     """Return the p-value of an offset by the F test; 1 if it is not determined."""
     known, value = fit.determined[part], fit.unknowns.offsets[part]
     if not known.any():
         return 1.0
     covariance = fit.covariance[part, part][np.ix_(known, known)]
-    # A pseudoinverse: exact paths without turns determine an offset in fewer directions than it has numbers.
+    # A pseudoinverse, since exact paths without rotation determine an offset only in some directions.
     statistic = value[known] @ np.linalg.pinv(covariance, hermitian=True) @ value[known] / known.sum()
     return float(fisher.sf(statistic, known.sum(), fit.degrees))
 
 
 def _numbers(values: Iterable[float], sds: Iterable[float], unit: str = "") -> str:
-    """Format values with standard deviations, to two digits of these."""
+    """Format values with standard deviations, to two digits of the latter."""
     shown = []
     for value, sd in zip(values, sds, strict=True):
         digits = int(np.clip(1 - np.floor(np.log10(max(sd, 1e-6))), 0, 6)) if np.isfinite(sd) else 0

@@ -1,10 +1,10 @@
-"""Errors of matched trajectories: absolute (ATE) and relative (RPE; RTE and RRE of each pair), and their NEES.
+"""Compute absolute (ATE) and relative errors (RPE; RTE and RRE of each pair) of matched trajectories, and the NEES.
 
 ATE: distance of the camera centres from the ground truth after alignment.
 
 RPE: for poses `Q` (truth) and `P` (estimate), camera -> world, the error of the pair (i, j) is the motion
 `E = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`; the length of its translation is the RTE, the angle of its rotation the RRE, and the
-RPE is their root mean square. No alignment is needed; a reconstruction of free scale must be scaled before.
+RPE is their root mean square. No alignment is needed; a reconstruction of unknown scale must be scaled before.
 
 Source: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
 
@@ -31,7 +31,7 @@ Unit = Literal["poses", "seconds", "metres"]
 UNITS: tuple[Unit, ...] = get_args(Unit)
 _MAX_POSES = 2**31
 PATH_TOLERANCE = 0.1
-"""Share of a delta in seconds or metres by which overlapping pairs may miss it; evo's default."""
+"""Maximum relative deviation of overlapping pairs from a delta in seconds or metres; evo's default."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class ErrorStatistics:
 
 @dataclass(frozen=True, eq=False)
 class AbsoluteError:
-    """Fields: errors float64 [n], metres, one per pose; alignment of the estimate to the ground truth."""
+    """ATE of a trajectory. errors: float64 [n], metres, by pose. alignment: of the estimate to the ground truth."""
 
     errors: Float[np.ndarray, " n"]
     alignment: Similarity
@@ -116,9 +116,9 @@ def relative_error(
     """Return the RPE of matched trajectories (see `associate`) over `delta`, measured along the ground truth.
 
     Pairs are consecutive, (0, delta), (delta, 2 delta), ..., as in evo; with `all_pairs` they overlap: (0, delta),
-    (1, 1 + delta), ... In seconds and metres a pair ends with the first pose at least `delta` later; overlapping pairs
-    with the nearest one, if it is within a tenth of delta. A trajectory shorter than delta gives empty arrays.
-    InputError if `delta` or `unit` is invalid.
+    (1, 1 + delta), ... In seconds and metres a pair ends with the first pose at least `delta` later; an overlapping
+    pair with the nearest pose, if its distance is within a tenth of delta. For a trajectory shorter than delta the
+    arrays are empty. Raises InputError if `delta` or `unit` is invalid.
     """
     first, second = pairs(truth, delta, all_pairs, unit)
     error = _motion(
@@ -141,36 +141,36 @@ def pairs(
     check_real("delta", delta)
     if unit == "poses":
         if not (1 <= delta <= _MAX_POSES) or delta != int(delta):
-            raise InputError(f"`delta` must be an integer of poses from 1 to {_MAX_POSES}, got {delta}")
+            raise InputError(f"`delta` must be an integer from 1 to {_MAX_POSES}, got {delta}")
         first = np.arange(0, max(len(trajectory) - int(delta), 0), 1 if all_pairs else int(delta))
         return first, first + int(delta)
     if not (np.isfinite(delta) and delta > 0):
         raise InputError(f"`delta` must be more than 0 {unit}, got {delta}")
     if unit == "seconds":
-        way = trajectory.timestamps - trajectory.timestamps[:1]
+        along = trajectory.timestamps - trajectory.timestamps[:1]
     else:
         steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
-        way = np.concatenate([np.zeros(min(len(trajectory), 1)), np.cumsum(steps)])
-    return _overlapping(way, delta) if all_pairs else _consecutive(way, delta)
+        along = np.concatenate([np.zeros(min(len(trajectory), 1)), np.cumsum(steps)])
+    return _overlapping(along, delta) if all_pairs else _consecutive(along, delta)
 
 
-def _consecutive(way: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of which each begins where the one before ended; `way` is non-decreasing."""
-    delta -= 1e-9 * delta  # `way` has rounding errors: an exact delta must count as reached
+def _consecutive(along: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return consecutive pairs; `along` is the non-decreasing coordinate of each pose, in seconds or metres."""
+    delta -= 1e-9 * delta  # `along` has rounding errors: an exact delta must count as reached
     ends, row = [], 0
-    while row < len(way):
+    while row < len(along):
         ends.append(row)
-        row = max(int(np.searchsorted(way, way[row] + delta)), row + 1)
+        row = max(int(np.searchsorted(along, along[row] + delta)), row + 1)
     rows = np.array(ends, int)
     return rows[:-1], rows[1:]
 
 
-def _overlapping(way: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of each row with the later one whose distance is nearest to `delta`; the first of equals."""
-    first = np.arange(max(len(way) - 1, 0))
-    after = np.clip(np.searchsorted(way, way[first] + delta), first + 1, len(way) - 1)
-    before = np.maximum(np.searchsorted(way, way[np.maximum(after - 1, 0)]), first + 1)
-    to_after, to_before = np.abs(way[after] - way[first] - delta), np.abs(way[before] - way[first] - delta)
+def _overlapping(along: np.ndarray, delta: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return pairs of each row with the later row whose distance is nearest to `delta`; for ties the first."""
+    first = np.arange(max(len(along) - 1, 0))
+    after = np.clip(np.searchsorted(along, along[first] + delta), first + 1, len(along) - 1)
+    before = np.maximum(np.searchsorted(along, along[np.maximum(after - 1, 0)]), first + 1)
+    to_after, to_before = np.abs(along[after] - along[first] - delta), np.abs(along[before] - along[first] - delta)
     second = np.where(to_before <= to_after, before, after)
     near = np.minimum(to_before, to_after) <= PATH_TOLERANCE * delta
     return first[near], second[near]
@@ -200,9 +200,9 @@ def pose_consistency(
 ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " k"]]:
     """Return the NEES of each position and of each rotation, for standard deviations relative to the first pose.
 
-    3 is expected where the deviations are right, more where they are too small. Both trajectories are expressed
-    relative to the first matched pose. Standard deviations (metres, rad) are isotropic. scale: factor on the estimate's
-    lengths. Poses with a standard deviation of zero or NaN are left out; InputError if none is left.
+    The expected value is 3 if the standard deviations are correct, and larger if they are too small. Both trajectories
+    are expressed relative to the first matched pose. Standard deviations (metres, rad) are isotropic. scale: factor on
+    the estimate's lengths. Poses with a standard deviation of zero or NaN are left out; raises InputError if all are.
     """
     rows, others = nearest_in_time(estimate.timestamps, truth.timestamps, MAX_TIME_DIFFERENCE)
     found, true = (
@@ -215,10 +215,8 @@ def pose_consistency(
 
 
 def _nees(errors: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Return the NEES of errors [n, 3] with the covariances `sigma`^2 I, of those with a standard deviation."""
-    stated = np.isfinite(sigma) & (sigma > 0)
-    if not stated.any():
+    """Return the NEES of errors [n, 3] with covariances `sigma`^2 I, without those of unknown standard deviation."""
+    known = np.isfinite(sigma) & (sigma > 0)
+    if not known.any():
         raise InputError("`place_sigma` and `rotation_sigma` must be positive and finite for at least one matched pose")
-    covariances = sigma[stated, None, None] ** 2 * np.eye(3)
-    white = np.linalg.solve(np.linalg.cholesky(covariances), errors[stated][..., None])[..., 0]
-    return (white**2).sum(axis=1)
+    return (errors[known] ** 2).sum(axis=1) / sigma[known] ** 2

@@ -1,4 +1,4 @@
-"""All usual errors of an estimated trajectory in one report."""
+"""Report all usual errors of an estimated trajectory."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -13,22 +13,24 @@ from vggtgeo.geometry.trajectory import Trajectory
 from vggtgeo.io.errors import InputError
 
 MIN_MATCHES = 3
+"""Minimum number of matched poses for an evaluation."""
 FEW_MATCHES = 10
-"""An alignment fits up to seven parameters; with fewer poses it hides most of the error."""
+"""Number of matched poses below which the alignment, of up to seven parameters, hides most of the error."""
 MIN_COVERAGE = 0.5
+"""Share of the ground truth's duration below which the report warns."""
 MAX_GAP = 1.0
-"""Seconds between two estimated poses up to which the time between them counts as covered."""
+"""Maximum seconds between two estimated poses for the time between them to count as covered."""
 ABSURD_SCALE = 3.0
-"""A scale beyond this factor, either way, indicates other units or a non-metric estimate."""
+"""Factor of the scale, in either direction, above which units differ or the estimate is not metric."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryReport:
     """Errors of a trajectory.
 
-    Fields: matched, estimated, true: number of poses compared, in the estimate, in the ground truth; coverage: share of
-    the ground truth's duration covered by the estimate, without gaps above a second; se3, sim3, yaw, unaligned: ATE
-    after each alignment, and without; relative: RPE as estimated; relative_sim3: RPE after the scale of the Sim(3)
+    Fields: matched, estimated, true: number of compared poses, of poses in the estimate, and in the ground truth;
+    coverage: share of the ground truth's duration that the estimate covers, without gaps above a second; se3, sim3,
+    yaw, unaligned: ATE after each alignment, and without one; relative: RPE; relative_sim3: RPE after the Sim(3)
     alignment.
     """
 
@@ -45,7 +47,7 @@ class TrajectoryReport:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Reasons to doubt these numbers, as sentences."""
+        """Reasons to doubt these errors."""
         found = []
         scale = self.sim3.alignment.scale
         if self.matched < FEW_MATCHES:
@@ -56,7 +58,7 @@ class TrajectoryReport:
             )
         if self.coverage < MIN_COVERAGE:
             found.append(
-                f"the estimate covers {100 * self.coverage:.0f} % of the truth's duration; the rest is not evaluated"
+                f"the estimate covers {100 * self.coverage:.0f} % of the ground truth; the rest is not evaluated"
             )
         if not 1 / ABSURD_SCALE <= scale <= ABSURD_SCALE:
             found.append(f"the scale is {scale:.3g}: the units differ, which errors after Sim(3) do not show")
@@ -108,11 +110,11 @@ def evaluate_trajectory(
     unit: Unit = "poses",
     vertical: tuple[float, float, float] = VERTICAL,
 ) -> TrajectoryReport:
-    """Match the two by time (within `max_dt` seconds) and compute ATE and RPE.
+    """Match the trajectories by time (within `max_dt` seconds) and compute ATE and RPE.
 
-    delta, unit: of the RPE's pairs: matched poses, seconds, or metres of the true path. vertical: up in the world of
-    the ground truth, for the alignment of heading and position. InputError if fewer than three poses match: an
-    alignment would hide any error.
+    delta, unit: distance of the RPE's pairs, in matched poses, seconds, or metres of the true path. vertical: upward
+    direction in the ground truth's world, for the alignment of yaw and position. Raises InputError if fewer than three
+    poses match: an alignment would hide any error.
 
     Example:
         >>> import vggtgeo as vg
@@ -124,8 +126,7 @@ def evaluate_trajectory(
     matched, reference = associate(estimate, truth, max_dt)
     if len(matched) < MIN_MATCHES:
         raise InputError(
-            f"{len(matched)} poses match within {max_dt:g} s; at least {MIN_MATCHES} are needed: "
-            f"{spans(estimate, truth)}"
+            f"at least {MIN_MATCHES} poses must match within {max_dt:g} s, got {len(matched)}: {spans(estimate, truth)}"
         )
     sim3 = absolute_error(matched, reference, "sim3")
     return TrajectoryReport(
@@ -145,8 +146,8 @@ def evaluate_trajectory(
 def coverage(estimate: Trajectory, truth: Trajectory) -> float:
     """Return the share of the ground truth's duration between estimated poses at most `MAX_GAP` seconds apart.
 
-    If the ground truth itself has a larger interval, gaps of two of its intervals are allowed. NaN for a ground truth
-    without duration.
+    If the ground truth has larger intervals, gaps of two of its intervals are allowed. NaN for a ground truth without
+    duration.
     """
     if len(truth) < 2:
         return float("nan")
@@ -156,7 +157,7 @@ def coverage(estimate: Trajectory, truth: Trajectory) -> float:
 
 
 def followed(times: Float[np.ndarray, " n"], estimate: Trajectory, truth: Trajectory) -> Bool[np.ndarray, " n"]:
-    """Return which of `times` (seconds) are covered as in `coverage`, or are at an estimated pose."""
+    """Return which of `times` (seconds) are covered as in `coverage`, or have an estimated pose."""
     poses = estimate.timestamps
     after = np.searchsorted(poses, times)
     close = np.concatenate([[False], _close(estimate, truth), [False]])

@@ -1,1 +1,1 @@
-"""Errors and files: what everything else may use."""
+"""Errors, argument validation and files, for use by all other packages."""

@@ -1,8 +1,8 @@
-"""Read `.npz` archives of any origin safely: nothing unasked is read, and no declared size is believed.
+"""Read `.npz` archives of any origin safely.
 
 An archive may unpack to a thousand times its size, a header may declare an array of 70 TiB, and an array of objects is
-a pickle, which runs code. So the headers of the requested arrays are checked first, against the archive and by the
-caller, and only then their data are read.
+a pickle, which runs code. So only requested arrays are read, and their headers are checked first, against a limit and
+by the caller.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ import numpy as np
 from vggtgeo.io.errors import InputError
 
 MAX_BYTES = 2**28
-"""Bytes of all arrays together that are read: 5 million point observations."""
-# What zipfile, zlib and numpy raise for damaged archives and headers.
+"""Default limit of the size of all arrays together: 5 million point observations."""
+# Exceptions that zipfile, zlib and numpy raise for damaged archives and headers.
 UNREADABLE = (
     *(ValueError, OSError, EOFError, RuntimeError, NotImplementedError, OverflowError, MemoryError, SyntaxError),
     *(TypeError, KeyError, zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError),
@@ -45,7 +45,7 @@ class ArrayHeader:
 
 
 def _header(stream: io.BufferedIOBase | IO[bytes]) -> ArrayHeader:
-    """Read the header of an array in NumPy's format, up to its data; raise ValueError if it is invalid."""
+    """Read the header of an array in NumPy's format; raise ValueError if it is invalid."""
     formats = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, _, dtype = formats[np.lib.format.read_magic(stream)](stream)
     return ArrayHeader(tuple(map(int, shape)), dtype)
@@ -78,10 +78,12 @@ class Archive:
                 headers[name] = _header(stream)
         total = sum(header.bytes for header in headers.values())
         if total > limit:
-            raise InputError(f"`{self.path}` has {total / 2**20:.0f} MiB of arrays, must be at most {limit >> 20} MiB")
+            raise InputError(
+                f"`{self.path}` must have at most {limit >> 20} MiB of arrays, got {total / 2**20:.0f} MiB"
+            )
         check(headers)
         found = {}
-        for name in headers:  # a ValueError for an array of objects, or of another size than its header declares
+        for name in headers:  # raises ValueError for an array of objects, or of another size than in its header
             with self.file.open(self.members[name]) as stream:
                 found[name] = np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
         return found
@@ -89,7 +91,7 @@ class Archive:
 
 @contextmanager
 def open_archive(path: Path, what: str) -> Iterator[Archive]:
-    """Open `path`; raise InputError if it is missing or damaged. what: a noun for messages ("a map")."""
+    """Open `path`; raise InputError if it is missing or damaged. what: its content, for errors ("a map")."""
     if not path.is_file():
         raise InputError(f"`{path}` does not exist or is not a file; give the file of {what}")
     try:

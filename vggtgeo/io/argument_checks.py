@@ -1,7 +1,7 @@
-"""Argument validation. Each error names the argument, what it is and what it must be.
+"""Validate arguments. Each error names the argument, what it must be, and its value.
 
-Checks of what a user gives raise `InputError`. Checks of the perception roles (`check_fields`, `check_array` and those
-below it) raise ValueError.
+Checks of the user's input raise `InputError`. Checks of the perception roles (`check_fields`, `check_array` and those
+after it) raise ValueError.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from vggtgeo.io.errors import InputError
 
 
 def check_kind(name: str, given: Any, kind: Any, expected: str) -> None:
-    """Raise InputError unless `given` has this type, or one of these; expected: the type, and how to obtain it."""
+    """Raise InputError unless `given` has the type `kind`; expected: a noun for the type, and how to obtain it."""
     if not isinstance(given, kind):
-        raise InputError(f"`{name}` is of the type `{type(given).__name__}`; expected {expected}")
+        raise InputError(f"`{name}` must be {expected}, got the type `{type(given).__name__}`")
 
 
 def path_of(name: str, given: Any) -> Path:
@@ -34,40 +34,40 @@ def path_of(name: str, given: Any) -> Path:
     """
     found = os.fspath(given) if isinstance(given, str | os.PathLike) else given
     if not isinstance(found, str):
-        raise InputError(f"`{name}` is {given!r:.60}; expected a path: a text, or a `pathlib.Path`")
+        raise InputError(f"`{name}` must be a text or a `pathlib.Path`, got {given!r:.60}")
     if not found:
-        raise InputError(f"`{name}` is empty, which would mean the working folder; give a path")
-    return Path(os.path.expanduser(found))  # `Path.expanduser` fails for an unknown user
+        raise InputError(f"`{name}` must not be empty, which would mean the current folder; give a path")
+    return Path(os.path.expanduser(found))  # `Path.expanduser` raises for an unknown user
 
 
-def check_whole(name: str, given: Any, least: int = 0, most: int | None = None) -> None:
+def check_whole(name: str, given: Any, minimum: int = 0, maximum: int | None = None) -> None:
     """Raise InputError unless `given` is an integer of Python or numpy in the range; booleans are not integers."""
     whole = isinstance(given, numbers.Integral) and not isinstance(given, bool | np.bool_)
-    if not whole or given < least or (most is not None and given > most):
-        until = "" if most is None else f", at most {most}"
-        raise InputError(f"`{name}` is {given!r:.60}; it must be a whole number, at least {least}{until}")
+    if not whole or given < minimum or (maximum is not None and given > maximum):
+        until = "" if maximum is None else f" and at most {maximum}"
+        raise InputError(f"`{name}` must be a whole number of at least {minimum}{until}, got {given!r:.60}")
 
 
 def check_real(name: str, given: Any, must: str = "a number") -> None:
     """Raise InputError unless `given` is one real number or infinity."""
     found = np.asarray(given)
     if found.ndim or found.dtype.kind not in "iuf" or np.isnan(found):
-        what = str(given) if found.dtype.kind == "f" and not found.ndim else f"{given!r:.60}"
-        raise InputError(f"`{name}` is {what}; it must be {must}")
+        got = str(given) if found.dtype.kind == "f" and not found.ndim else f"{given!r:.60}"
+        raise InputError(f"`{name}` must be {must}, got {got}")
 
 
 def check_positive(name: str, given: Any, unit: str) -> None:
     """Raise InputError unless `given` is a positive, finite number."""
     check_real(name, given, f"positive {unit}")
     if not 0 < given < math.inf:
-        raise InputError(f"`{name}` is {given}; it must be positive {unit}")
+        raise InputError(f"`{name}` must be positive {unit}, got {given}")
 
 
 def check_within(name: str, given: Any, low: float, high: float, units: str = "") -> None:
     """Raise InputError unless `given` is a number from `low` to `high`."""
     check_real(name, given)
     if not low <= given <= high:
-        raise InputError(f"`{name}` is {given}; it must be from {low:g} to {high:g}{units}")
+        raise InputError(f"`{name}` must be from {low:g} to {high:g}{units}, got {given}")
 
 
 def real_numbers(name: str, given: Any) -> np.ndarray:
@@ -83,11 +83,11 @@ def real_numbers(name: str, given: Any) -> np.ndarray:
     except ValueError as error:
         raise InputError(f"`{name}` cannot be read as an array: {error}") from error
     if found.dtype.kind not in "biuf":
-        what = {"c": "complex numbers", "M": "dates", "m": "spans of time"}.get(found.dtype.kind, f"{given!r:.60}")
-        raise InputError(f"`{name}` is {what}; expected real numbers")
+        got = {"c": "complex numbers", "M": "dates", "m": "durations"}.get(found.dtype.kind, f"{given!r:.60}")
+        raise InputError(f"`{name}` must be real numbers, got {got}")
     if isinstance(given, np.ma.MaskedArray) and np.ma.is_masked(given):
         raise InputError(
-            f"`{name}` has masked entries, which have no value; leave them out, or fill them (`.filled(...)`)"
+            f"`{name}` must not have masked entries, which have no value; remove or fill them (`.filled(...)`)"
         )
     return found
 
@@ -100,12 +100,12 @@ def real_array(name: str, given: Any, shape: Sequence[int | None]) -> np.ndarray
     ):
         letters = iter("nmk")
         wanted = ", ".join(next(letters) if length is None else str(length) for length in shape)
-        raise InputError(f"`{name}` has shape {found.shape}; it must be [{wanted}]")
+        raise InputError(f"`{name}` must have shape [{wanted}], got {list(found.shape)}")
     return found
 
 
 def check_plain(name: str, given: Mapping[str, Any]) -> None:
-    """Raise InputError for values that JSON cannot hold: before hours of work, not when they are written."""
+    """Raise InputError for values that JSON cannot represent, so that a run need not fail when it writes them."""
     check_kind(name, given, Mapping, "a dictionary of plain values")
     try:
         json.JSONEncoder(allow_nan=False).encode(given)

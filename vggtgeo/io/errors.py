@@ -1,4 +1,4 @@
-"""Exceptions, warnings and messages about invalid input."""
+"""Define the exceptions and warnings about invalid input, and format their messages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 class InputError(ValueError):
-    """The user's input (a path, a file, a number) is invalid; the message says what is wrong and what to do.
+    """Invalid input of the user (a path, a file, a number); the message says what is wrong and what to do.
 
     Example:
         >>> import vggtgeo as vg
@@ -23,19 +23,19 @@ class InputError(ValueError):
 
 
 class InputWarning(UserWarning):
-    """A part of the user's input is left out or assumed; the message names it, and the work continues."""
+    """A part of the user's input is ignored or assumed, and the run continues; the message names it."""
 
 
 class NoteWarning(InputWarning):
-    """A reader did what its layout requires (ignored an IMU, chose the better of two depths); nothing is wrong."""
+    """Information on how an input was read (an IMU is ignored, one of two depths is chosen); nothing is wrong."""
 
 
 class GuessedCameraWarning(InputWarning):
-    """The camera is unknown and will be estimated: normal for a video, a defect of a recording with a known camera."""
+    """The camera is unknown and will be estimated: normal for a video, but not for a recording with a calibration."""
 
 
 class UnusableDepthWarning(InputWarning):
-    """No depth is in the range of a room in the usual unit of its files."""
+    """No depth image has a valid pixel, probably because its unit is another one."""
 
 
 class LeftOutWarning(InputWarning):
@@ -47,17 +47,18 @@ class LeftOutWarning(InputWarning):
 
 
 def warn(message: str | InputWarning, category: type[InputWarning] = InputWarning) -> None:
-    """Warn about the input, at the place that called the function in which this is called."""
+    """Warn about the input; the warning points to the caller of the function that calls this one."""
     warnings.warn(message, category, stacklevel=3)
 
 
 MAX_LENGTH = 1200
-"""Characters of a line; a message may quote a whole damaged file."""
+"""Maximum characters of a line: a message may quote a whole damaged file."""
 
 
 def one_line(message: str) -> str:
-    """Return `message` without line breaks and control characters (a file name may contain a code that clears the
-    screen), at most `MAX_LENGTH` characters, its middle left out.
+    """Return `message` without line breaks and control characters, shortened in the middle to `MAX_LENGTH` characters.
+
+    Control characters are removed since a file name may contain, for example, a code that clears the screen.
     """
     text = "".join(sign if sign.isprintable() else f"\\x{ord(sign):02x}" for sign in " ".join(message.split()))
     half = MAX_LENGTH // 2
@@ -67,8 +68,8 @@ def one_line(message: str) -> str:
 _lock = Lock()
 
 
-class _Showing:
-    """Shows warnings, and adds those about the input to `lists`."""
+class _CollectingShow:
+    """Function for `warnings.showwarning` that also adds warnings about the input to `lists`."""
 
     def __init__(self, as_before: Callable[..., Any]) -> None:
         self.as_before = as_before
@@ -85,30 +86,30 @@ class _Showing:
 def collected_warnings() -> Iterator[list[Warning | str]]:
     """Yield a list of the warnings about the input, in order, while they are shown as usual.
 
-    Python has one function to show warnings for all threads: if several threads collect at the same time, each gets the
-    warnings of all, since a run that misses a warning would be trusted too much.
+    Python has one function to show warnings for all threads, so if several threads collect at the same time, each gets
+    the warnings of all. That is better than missing one: the verdict of a run depends on its warnings.
     """
     collected: list[Warning | str] = []
     with _lock:
         showing = warnings.showwarning
-        if not isinstance(showing, _Showing):
-            showing = warnings.showwarning = _Showing(showing)
+        if not isinstance(showing, _CollectingShow):
+            showing = warnings.showwarning = _CollectingShow(showing)
         showing.lists.append(collected)
     try:
         yield collected
     finally:
-        with _lock:  # the first to begin may be the first to end
+        with _lock:  # threads may end in any order
             showing.lists[:] = [other for other in showing.lists if other is not collected]
             if not showing.lists and warnings.showwarning is showing:
                 warnings.showwarning = showing.as_before
 
 
 def install_hint(extra: str) -> str:
-    """Say how to install an extra of `pyproject.toml`, in a clone and with a released package."""
+    """Return how to install an extra of `pyproject.toml`, in a clone and with a released package."""
     clone, release = f"pip install -e '.[{extra}]'", f"pip install 'vggtgeo[{extra}]'"
     return f"install the extra `{extra}`: `{clone}` in a clone, `{release}` elsewhere"
 
 
-def put_back_hint(package: str, version: str) -> str:
+def reinstall_hint(package: str, version: str) -> str:
     """Return how to restore a package whose files another package has overwritten."""
-    return f"`pip install --force-reinstall --no-deps {package}=={version}` puts them back"
+    return f"`pip install --force-reinstall --no-deps {package}=={version}` restores them"

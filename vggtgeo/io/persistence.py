@@ -1,18 +1,18 @@
-"""Save values of listed classes (states, maps, checkpoints, problems, scenes, cached arrays) as a file; load them.
+"""Save values of known classes (states, maps, checkpoints, problems, scenes, cached arrays) in a file, and load them.
 
 A file is a zip archive of two arrays of bytes. `header.npy` is JSON: the kind of the file, its version, plain facts
-about it, the classes and their fields, a table of the named arrays, and the tree of values. `data.npy` holds the bytes
-of all arrays. A value comes back exactly: floats, element types, memory order (a sum depends on it), and which fields
-share an array.
+about it, the classes and their fields, a table of the named arrays, and the tree of values. `data.npy` has the bytes of
+all arrays. A loaded value equals the saved one exactly, including element types, memory order (on which the rounding of
+a sum depends), and which fields share an array.
 
-Loading executes nothing: a file names classes, and the reader looks them up in its own list. Fields are set past
-constructors, so that a loaded value equals the saved one. The header is checked before any data are read, and zip's
-checksums detect damage. A file of another version is refused.
+Loading runs no code of the file: the file names classes, and the reader looks them up in its own list. Fields are set
+without calling constructors, so that they are unchanged. The header is checked before any data are read, and zip's
+checksums detect damage. A file of another version is an error.
 
-In the tree, null, booleans, numbers and texts are themselves, and a list is a tuple. Everything else is an object:
-`l` a list, `d` a dictionary, `c` and `v` an object (number of its class, values of its fields), `k` a class, `t` an
-element type, `r` the result of a future; with the name of an array: `a` a numpy array, `s` a numpy scalar, `b` bytes,
-`j` a JAX array, `w` a weakly typed one.
+In the tree, null, booleans, numbers and texts stand for themselves, and a JSON list is a tuple. All else is a JSON
+object: `l` a list, `d` a dictionary, `c` and `v` an object (number of its class, values of its fields), `k` a class,
+`t` an element type, `r` the result of a future. With the name of an array it is: `a` a numpy array, `s` a numpy scalar,
+`b` bytes, `j` a JAX array, `w` a weakly typed JAX array.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.io.files import atomic_open
 
 MAX_HEADER = 2**27
-"""Bytes; the header of a state of 100,000 frames has 64 MiB."""
+"""Maximum bytes of a header; that of a state of 100,000 frames has 64 MiB."""
 HEADER, DATA = "header", "data"
-AGAIN = "use an unchanged copy, or write it again"
+REPAIR_HINT = "use an undamaged copy, or write it again"
 _ELEMENTS = "biufU"
 """Kinds of elements that arrays may have: booleans, integers, floats, texts."""
 _INVALID = (ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError, OverflowError)
@@ -51,7 +51,7 @@ def by_name(classes: Iterable[type]) -> dict[str, type]:
     named: dict[str, type] = {}
     for kind in classes:
         if named.setdefault(kind.__name__, kind) is not kind:
-            raise ValueError(f"two classes are called `{kind.__name__}`; rename one")
+            raise ValueError(f"classes must have different names, got `{kind.__name__}` twice")
     return named
 
 
@@ -59,9 +59,9 @@ def by_name(classes: Iterable[type]) -> dict[str, type]:
 class Format:
     """A kind of file.
 
-    Fields: kind, a noun ("map"); version, a number that grows when the classes change; classes that values may have, by
-    name; compressed, whether the data are compressed (at most `MAX_BYTES` of them are then read); hint, what to do
-    about an unknown class.
+    Fields: kind, a noun ("map"); version, increased when the classes change; classes, that values may have, by name;
+    compressed, whether the data are compressed (then at most `MAX_BYTES` are read); hint, for the error about an
+    unknown class.
     """
 
     kind: str
@@ -78,7 +78,7 @@ class Format:
         """Write a value and plain facts about it, atomically.
 
         Raises:
-            TypeError: a part of the value has a class that is not listed; names the part.
+            TypeError: a part of the value, which the message names, has an unknown class.
 
         """
         encoder = _Encoder(self)
@@ -93,7 +93,7 @@ class Format:
     def read(self, path: Path, as_array: Callable[[np.ndarray], Any] = jnp.asarray) -> tuple[Any, dict[str, Any]]:
         """Return the value and the facts of a file.
 
-        as_array: makes a JAX array from numpy's; `numpy.asarray` reads without using JAX, which a forked process needs.
+        as_array: makes a JAX array from a numpy array. A forked process must not use JAX: give `numpy.asarray` there.
 
         Raises:
             InputError: the file is missing, damaged, too large, inconsistent, or of another kind or version.
@@ -104,15 +104,15 @@ class Format:
             decoder = _Decoder(self, header["classes"], header["arrays"], data.reshape(-1).view(np.uint8), as_array)
             return decoder.value(header["tree"]), header["facts"]
         except _INVALID as error:
-            raise InputError(f"`{path}` is not a valid {self.kind}: {error}; {AGAIN}") from None
+            raise InputError(f"`{path}` is not a valid {self.kind}: {error}; {REPAIR_HINT}") from None
 
     def facts(self, path: Path) -> dict[str, Any]:
-        """Return the facts alone; raise InputError as `read` does."""
+        """Return only the facts; raise InputError as `read`."""
         facts: dict[str, Any] = self._parts(Path(path), with_data=False)[0]["facts"]
         return facts
 
     def _parts(self, path: Path, with_data: bool) -> tuple[dict[str, Any], np.ndarray]:
-        """Return the header, checked, and the data, empty if they are not read."""
+        """Return the checked header, and the data, which are empty without `with_data`."""
         with open_archive(path, self._article) as archive:
             header = self._header(archive)
             limit = MAX_BYTES if self.compressed else path.stat().st_size
@@ -132,25 +132,27 @@ class Format:
             kind, version, _ = (header[name] for name in ("vggtgeo", "version", "tree"))
             _, _, header["facts"] = list(header["classes"]), dict(header["arrays"]), dict(header["facts"])
         except _INVALID as error:
-            raise InputError(f"`{archive.path}` is not {self._article} of vggtgeo: {error!s:.200}; {AGAIN}") from None
+            raise InputError(
+                f"`{archive.path}` is not {self._article} of vggtgeo: {error!s:.200}; {REPAIR_HINT}"
+            ) from None
         if kind != self.kind:
-            raise InputError(f"`{archive.path}` is of kind {kind!r:.40}, must be {self.kind!r}")
+            raise InputError(f"`{archive.path}` must be of kind {self.kind!r}, got {kind!r:.40}")
         if version != self.version:
             raise InputError(
-                f"`{archive.path}` has version {version!r:.20}, must be {self.version}: use the program that wrote it"
+                f"`{archive.path}` must have version {self.version}, got {version!r:.20}: use the program that wrote it"
             )
         return header
 
 
 class _Encoder:
-    """Turns a value into JSON, a table of named arrays, and their bytes."""
+    """Encodes a value as JSON, a table of named arrays, and their bytes."""
 
     def __init__(self, layout: Format) -> None:
         self._kind = layout.kind
         self._names = {kind: name for name, kind in layout.classes.items()}
         self._numbers: dict[type, int] = {}
         self._seen: dict[int, str] = {}
-        self._alive: list[Any] = []  # an `id` must not be used twice
+        self._alive: list[Any] = []  # keeps arrays alive, so that their `id` is not used again
         self._size = 0
         self.classes: list[tuple[str, list[str]]] = []
         self.arrays: dict[str, list[Any]] = {}
@@ -183,7 +185,9 @@ class _Encoder:
             return {"t": value.str}
         if isinstance(value, type) and value in self._names:
             return {"k": self._names[value]}
-        raise TypeError(f"`{name}` is {value!r:.60} of type {kind.__qualname__}, which a {self._kind} cannot hold")
+        raise TypeError(
+            f"`{name}` must be of a type that a {self._kind} can hold, got {kind.__qualname__}: {value!r:.60}"
+        )
 
     def _items(self, values: Sequence[Any], name: str) -> list[Tree]:
         return [self.tree(item, f"{name}[{number}]") for number, item in enumerate(values)]
@@ -198,11 +202,11 @@ class _Encoder:
         return {"c": self._numbers[kind], "v": values}
 
     def _array(self, key: Any, name: str, values: np.ndarray) -> str:
-        """Add an array, once if several fields share it; return its name."""
+        """Add an array, only once if several fields share it; return its name."""
         if id(key) in self._seen:
             return self._seen[id(key)]
         if values.dtype.kind not in _ELEMENTS:
-            raise TypeError(f"`{name}` is an array of {values.dtype}, which a {self._kind} cannot hold")
+            raise TypeError(f"`{name}` must be an array of numbers or texts, got {values.dtype}")
         strides = None if values.flags.c_contiguous else list(values.strides)
         self.arrays[name] = [values.dtype.str, self._size, list(values.shape), strides]
         block = np.ascontiguousarray(values).reshape(-1).view(np.uint8)
@@ -214,7 +218,7 @@ class _Encoder:
 
 
 class _Decoder:
-    """Makes the value of a header and its bytes."""
+    """Decodes the value from a header and the bytes of its arrays."""
 
     def __init__(
         self,
@@ -261,14 +265,14 @@ class _Decoder:
 
     def _class(self, name: str) -> type:
         if name not in self._known:
-            raise ValueError(f"it holds a `{name!s:.60}`, which is not a known class{self._hint}")
+            raise ValueError(f"it has a value of the unknown class `{name!s:.60}`{self._hint}")
         return self._known[name]
 
     def _checked(self, name: str, fields: list[str]) -> type:
         kind = self._class(name)
         own = [field.name for field in dataclasses.fields(kind)]
         if own != list(fields):
-            raise ValueError(f"`{name}` has the fields {own}, but {fields} in the file (written by another version)")
+            raise ValueError(f"`{name}` must have the fields {own}, got {fields} (written by another version)")
         return kind
 
     def _object(self, kind: type, values: Sequence[Tree]) -> Any:
@@ -286,14 +290,14 @@ class _Decoder:
 
 
 def _element_type(name: str, element: Any) -> np.dtype[Any]:
-    # `numpy.dtype` also evaluates names of records and arbitrary text.
+    # Checked, since `numpy.dtype` would also evaluate names of records and other text.
     if not re.fullmatch(rf"[<>|=][{_ELEMENTS}]\d+", str(element)):
         raise ValueError(f"{name} must be of numbers, got {element!r:.60}")
     return np.dtype(element)
 
 
 def _weakly_typed(values: np.ndarray) -> jax.Array:
-    """Return a weakly typed array: JAX makes one of a Python number, or by an operation on weak types."""
+    """Return a weakly typed array, which JAX makes only of Python numbers and of other weakly typed arrays."""
     weak = jnp.asarray(values.dtype.type(0).item())
     return jnp.broadcast_to(weak, values.shape).at[...].set(values)
 
@@ -305,7 +309,7 @@ def _finished(value: Any) -> Future[Any]:
 
 
 def _strided(values: np.ndarray, strides: Sequence[int]) -> np.ndarray:
-    """Return the same values with other strides, as a view of a larger array has them."""
+    """Return the same values with other strides, as in a view of a larger array."""
     steps = list(zip(strides, values.shape, strict=True))
     if not values.size:
         return values
@@ -318,7 +322,7 @@ def _strided(values: np.ndarray, strides: Sequence[int]) -> np.ndarray:
 
 
 def _write_bytes(archive: zipfile.ZipFile, name: str, blocks: list[np.ndarray]) -> None:
-    """Write one member block by block, so that a map is not copied."""
+    """Write one member block by block, so that the arrays of a map are not copied."""
     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
         size = sum(block.nbytes for block in blocks)
         np.lib.format.write_array_header_1_0(member, {"descr": "|u1", "fortran_order": False, "shape": (size,)})

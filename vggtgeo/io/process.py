@@ -1,8 +1,8 @@
-"""The own process: signals as a request to stop that never leaves partial results, and its memory.
+"""Handle signals so that no partial results are written, and measure and return the memory of the process.
 
-An exception of a signal handler may be raised anywhere: between two files of one result, or inside a callback of a
-compiled library, which drops it. Where something must be completed, the first Ctrl-C, SIGTERM or SIGHUP is only
-recorded; the second raises KeyboardInterrupt.
+The exception of a signal handler may be raised anywhere: between two files of one result, or inside a callback of a
+compiled library, which ignores it. So in code that must be completed, the first Ctrl-C, SIGTERM or SIGHUP is only
+recorded, and the second raises KeyboardInterrupt.
 """
 
 from __future__ import annotations
@@ -22,26 +22,27 @@ _HEAPS = {
     "MALLOC_MMAP_THRESHOLD_": (-3, 8_000_000),
     "MALLOC_TRIM_THRESHOLD_": (-1, 32_000_000),
 }
-"""glibc's settings: environment variable, number in `malloc.h`, value. Number of heaps; bytes from which a block lies
-in none; free bytes that a heap keeps. With smaller limits, system calls for images cost a tenth of a run."""
+"""Settings of glibc's allocator: environment variable, number in `malloc.h`, value. They are the number of heaps, the
+size from which a block is allocated outside the heaps, and the free bytes that a heap keeps. With smaller sizes, system
+calls for images take a tenth of a run."""
 
 
 class Interruption:
-    """Whether a signal has requested to stop."""
+    """Records whether a signal has requested to stop."""
 
     def __init__(self) -> None:
         self.asked = False
         self._raises = False
 
     def on_signal(self, number: int, frame: Any) -> None:
-        """Record the first signal; raise KeyboardInterrupt at the next, or inside `at_once`."""
-        again, self.asked = self.asked, True
-        if self._raises or again:
+        """Record the first signal; raise KeyboardInterrupt for the next, or inside `at_once`."""
+        repeated, self.asked = self.asked, True
+        if self._raises or repeated:
             raise KeyboardInterrupt
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
-        """Raise at the first signal inside this block: for long work that can be repeated."""
+        """Raise at the first signal inside this block, for long work without partial results."""
         if self.asked:
             raise KeyboardInterrupt
         outer, self._raises = self._raises, True
@@ -52,8 +53,10 @@ class Interruption:
 
 
 def end_on_signals() -> None:
-    """Make SIGTERM (`kill`, a shutdown, a limit of a batch system) and SIGHUP (a closed terminal) raise
-    KeyboardInterrupt, as Ctrl-C does, unless they have other handlers (`nohup`). For a program's entry, not a library.
+    """Make SIGTERM and SIGHUP raise KeyboardInterrupt as Ctrl-C does, unless they have other handlers (`nohup`).
+
+    SIGTERM is sent by `kill`, a shutdown or the limits of a batch system, SIGHUP by a closed terminal. Call this in a
+    program's entry, not in a library.
     """
     for number in _signals():
         if signal.getsignal(number) is signal.SIG_DFL:
@@ -62,10 +65,10 @@ def end_on_signals() -> None:
 
 @contextmanager
 def interruption() -> Iterator[Interruption]:
-    """Record signals that would raise KeyboardInterrupt instead of raising it; yields the same object inside another.
+    """Record signals instead of raising KeyboardInterrupt; a nested call yields the object of the outer one.
 
-    Signals that end the process or are ignored keep doing so. Outside the main thread, where Python allows no handlers,
-    nothing is recorded.
+    Signals with other handlers are not changed. Outside the main thread, where Python allows no handlers, no signal is
+    recorded.
     """
     if threading.current_thread() is not threading.main_thread():
         yield Interruption()
@@ -93,9 +96,9 @@ def _signals() -> list[signal.Signals]:
 
 
 def return_freed_memory() -> None:
-    """Give freed memory back to the system, with glibc; nothing elsewhere.
+    """Return freed memory to the system, with glibc only.
 
-    Compilation and threads leave free blocks between others, up to half of a run's memory
+    Compilation and threads fragment the heap; free blocks are up to half of a run's memory
     (`benchmarks/stage_times.py` prints the peak).
     """
     if trim := _of_c_library("malloc_trim"):
@@ -105,7 +108,7 @@ def return_freed_memory() -> None:
 def share_heaps() -> None:
     """Make all threads allocate from two heaps of glibc, from which freed memory is returned.
 
-    For a program's entry, before its threads. Variables of the user (see mallopt(3)) take precedence.
+    Call this in a program's entry, before it starts threads. Variables of the user (see mallopt(3)) have priority.
     """
     if mallopt := _of_c_library("mallopt"):
         for name, (parameter, value) in _HEAPS.items():
@@ -120,7 +123,7 @@ def _of_c_library(name: str) -> Callable[..., int] | None:
 def peak_memory_gb() -> float:
     """Return the largest resident memory so far, GiB."""
     if sys.platform == "win32":
-        import psutil  # of all systems, but slow to import
+        import psutil  # not used on other systems, since the import is slow
 
         return float(psutil.Process().memory_info().peak_wset) / 2**30
     import resource  # POSIX only

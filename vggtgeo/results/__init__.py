@@ -1,1 +1,1 @@
-"""What a run leaves: a value in memory, files in a folder, and the way back."""
+"""Results of a run: in memory, written to a folder, and read from a folder."""

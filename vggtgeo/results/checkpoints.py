@@ -1,7 +1,7 @@
-"""Checkpoints of a run: a killed run that is resumed gives bit-identical results.
+"""Write checkpoints of a run, and resume a killed run from one, with bit-identical results.
 
 A checkpoint has the SLAM state, the state of the callbacks, warnings, times, and the identity of the run (settings,
-input, versions). Since a state is immutable, a thread writes it while the run continues; the file is replaced
+input, versions). A thread writes it while the run continues, since a state is immutable. The file is replaced
 atomically. The interval grows so that all checkpoints take at most `SHARE` of the run's processor time.
 """
 
@@ -26,7 +26,7 @@ from vggtgeo.io.argument_checks import check_real, path_of
 from vggtgeo.io.errors import InputError, InputWarning, LeftOutWarning
 from vggtgeo.io.persistence import Format, by_name
 from vggtgeo.models.onnx.bounds import Refusals
-from vggtgeo.results.output_checks import EVERY
+from vggtgeo.results.output_checks import CHECKPOINT_SECONDS
 from vggtgeo.results.summary import versions
 from vggtgeo.slam.callback import WindowRecord
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
@@ -37,17 +37,17 @@ from vggtgeo.slam.verdict.corner_recorder import FrameCorners
 SHARE = 0.025
 """Maximum share of a run's time for checkpoints."""
 _EXCERPT = 110
-"""Characters of a long setting that an error shows."""
+"""Maximum characters of a setting in an error."""
 
 
 @dataclass(frozen=True)
 class Checkpoints:
-    """Where and how often a run writes its checkpoint, and whether it resumes from an existing one.
+    """File and interval of a run's checkpoints, and whether the run resumes from an existing one.
 
     Fields:
         path: file of the checkpoint.
-        resume: resume from the file; if it does not exist, the run begins at its first frame.
-        every: minimum seconds between checkpoints, more if they are large; 0: after each frame.
+        resume: resume from the file; if it does not exist, the run starts at its first frame.
+        every: minimum seconds between checkpoints; the interval is longer if they are large. 0: after each frame.
 
     Example:
         >>> from pathlib import Path
@@ -60,13 +60,13 @@ class Checkpoints:
 
     path: Path
     resume: bool = False
-    every: float = EVERY
+    every: float = CHECKPOINT_SECONDS
 
     def __post_init__(self) -> None:
         path_of("path", self.path)
         check_real("every", self.every)
         if not 0 <= self.every < math.inf:
-            raise InputError(f"`every` is {self.every:g}; it must be seconds between checkpoints, at least 0")
+            raise InputError(f"`every` must be at least 0 seconds and finite, got {self.every:g}")
 
 
 Notice = tuple[str, int | None]
@@ -82,8 +82,8 @@ def notice_of(warning: Warning | str) -> Notice:
 class RunSoFar:
     """A run between two frames, as a checkpoint stores it.
 
-    callbacks: state of each callback by class name. refused: counts of `Refusals` by role. seconds: time by stage, s;
-    tracking and whole: time since the first frame, and since the start of the run, s.
+    callbacks: state of each callback by class name. refused: counts of `Refusals` by role. seconds: time by stage, s.
+    tracking: time since the first frame, s. whole: time since the start of the run, s.
     """
 
     slam: Slam
@@ -95,18 +95,18 @@ class RunSoFar:
     whole: float
 
     def merge_warnings(self, collected: Iterable[Warning | str]) -> list[Warning | str]:
-        """Return the checkpoint's warnings, then those of `collected` that are not repeated by rereading the input."""
+        """Return the checkpoint's warnings, then those of `collected` that are not the same on reading frames again."""
         known = Counter(self.notices)
-        fresh: list[Warning | str] = []
+        new: list[Warning | str] = []
         for warning in collected:
             if known[notice_of(warning)] > 0:
                 known[notice_of(warning)] -= 1
             else:
-                fresh.append(warning)
+                new.append(warning)
         before = (
             InputWarning(text) if frames is None else LeftOutWarning(text, frames) for text, frames in self.notices
         )
-        return [*before, *fresh]
+        return [*before, *new]
 
     def restore_refusals(self, refusals: Mapping[str, Refusals]) -> None:
         """Add the checkpoint's counts to `refusals`."""
@@ -114,23 +114,23 @@ class RunSoFar:
             vars(refusals[role]).update(vars(Refusals(*counts)))
 
 
-KEPT_CLASSES = (*STATE_CLASSES, RunSoFar, FrameCorners, WindowRecord)
-CHECKPOINT = Format("checkpoint", VERSION, by_name(KEPT_CLASSES))
+CHECKPOINT_CLASSES = (*STATE_CLASSES, RunSoFar, FrameCorners, WindowRecord)
+CHECKPOINT = Format("checkpoint", VERSION, by_name(CHECKPOINT_CLASSES))
 
 
 def run_identity(
     settings: SlamSettings, roles: Roles, source: Mapping[str, Any], networks: Mapping[str, str], **more: Any
 ) -> dict[str, str]:
-    """Return everything that the result of a run depends on, as text by name; a resumed run must have the same.
+    """Return all that the result of a run depends on, as text by name; a resumed run must have the same identity.
 
     source: `Source.identity`. networks: digest of each network file. more: further values.
     """
     by_stage = {
         f"{group}.{name}": value for group, values in vars(settings).items() for name, value in vars(values).items()
     }
-    every = {**versions(), **source, **by_stage, **vars(roles), **networks, **more}
+    values = {**versions(), **source, **by_stage, **vars(roles), **networks, **more}
     # The default `repr` of an object contains its address, which differs between processes.
-    return {name: re.sub(r" at 0x[0-9a-f]+", "", repr(value)) for name, value in every.items()}
+    return {name: re.sub(r" at 0x[0-9a-f]+", "", repr(value)) for name, value in values.items()}
 
 
 @in_double_precision
@@ -145,11 +145,11 @@ def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> R
         return None
     saved = CHECKPOINT.facts(asked.path)["identity"]
     differing = [name for name in {**saved, **identity} if saved.get(name) != identity.get(name)]
-    if differing:  # report the shortest: a seed, for example, also appears in every role that samples
+    if differing:  # report the shortest: the seed, for example, is also a part of every role that samples
         name = min(differing, key=lambda one: len(saved.get(one, "")) + len(identity.get(one, "")))
         before, now = _excerpt(saved.get(name)), _excerpt(identity.get(name))
         raise InputError(
-            f"`{name}` is {now}, but the run in `{asked.path}` had {before}: use the same, or start again with "
+            f"`{name}` must be {before} as in the run in `{asked.path}`, got {now}: use the same, or start again with "
             "`--no-resume`"
         )
     found: RunSoFar = CHECKPOINT.read(asked.path)[0]
@@ -161,7 +161,7 @@ def _excerpt(value: str | None) -> str:
     return "nothing" if value is None else value if len(value) <= _EXCERPT else f"{value[:_EXCERPT]}..."
 
 
-def frames_kept(path: Path) -> str:
+def frame_count_text(path: Path) -> str:
     """Return the number of frames in a checkpoint, as text."""
     count = CHECKPOINT.facts(path)["frames"]
     return f"{count} frame{'s' * (count != 1)}"
@@ -172,13 +172,13 @@ def check_same_frame(asked: Checkpoints, frame: Frame | None) -> None:
     saved = CHECKPOINT.facts(asked.path)
     if frame is None or saved["digest"] != digest_of(frame):
         raise InputError(
-            f"frame {saved['last']} differs from the one of the run in `{asked.path}`: use the same input, or start "
-            "again with `--no-resume`"
+            f"frame {saved['last']} differs from that of the run in `{asked.path}`: use the same input, or start again "
+            "with `--no-resume`"
         )
 
 
 def digest_of(frame: Frame) -> str:
-    """Return the SHA-256 of time, image and depth."""
+    """Return the SHA-256 of a frame's time, image and depth."""
     digest = hashlib.sha256(repr((frame.index, float(frame.timestamp), frame.image.shape)).encode())
     for image in (frame.image, frame.depth):
         if image is not None:
@@ -197,9 +197,7 @@ def digest_of_map(known: Slam) -> str:
 
 @dataclass(eq=False)
 class CheckpointWriter:
-    """Writes the checkpoints of one run. gather: returns the run so far, called between two frames. message: shows a
-    text to the user.
-    """
+    """Writes the checkpoints of one run. gather: returns the run so far. message: shows a text to the user."""
 
     asked: Checkpoints
     identity: Mapping[str, str]
@@ -214,14 +212,14 @@ class CheckpointWriter:
         self._next = time.monotonic() + self.asked.every
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
-        """Start to write a checkpoint after a frame, if it is time."""
+        """Start to write a checkpoint after a frame, if the interval has passed."""
         if self._writing is not None and (self._writing.done() or self.asked.every == 0):
             self._wait()
         if self._writing is None and time.monotonic() >= self._next:
             self._begin(slam, frame)
 
     def on_end(self, slam: Slam, frame: Frame | None) -> None:
-        """Write a checkpoint after the last frame, if the run was long enough for an earlier one."""
+        """Write a checkpoint after the last frame, unless the run was too short for any checkpoint."""
         self._wait()
         if self._written and frame is not None:
             self._begin(slam, frame)
@@ -235,7 +233,7 @@ class CheckpointWriter:
         self._writing = self._pool.submit(self._write, self.gather(slam), frame)
 
     def _write(self, so_far: RunSoFar, frame: Frame) -> float:
-        """Write the file, once a window that is being adjusted is done; return the processor time, s."""
+        """Write the file, after waiting for a window that is being adjusted; return the processor time, s."""
         began = time.thread_time()
         count = len(so_far.slam.frames)
         facts = {"identity": self.identity, "frames": count, "last": frame.index, "digest": digest_of(frame)}
@@ -253,4 +251,6 @@ class CheckpointWriter:
             self._next += max(self.asked.every, took / SHARE) if self.asked.every else 0.0
         except (OSError, TypeError, ValueError) as error:
             self._written, self._next = False, math.inf
-            self.message(f"cannot write the checkpoint `{self.asked.path}`, this run cannot be resumed: {error}")
+            self.message(
+                f"the checkpoint `{self.asked.path}` cannot be written, so this run cannot be resumed: {error}"
+            )

@@ -1,4 +1,4 @@
-"""Write the data files of a run's folder, each atomically."""
+"""Write the data files of a run's folder, each of them atomically."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ DEPTH_README = (
     "NNNNNN.confidence.png: its confidence, 8 bit, 255 = 1.\n"
 )
 METRES = "5000 counts are one metre, as in the TUM RGB-D format.\n"
-FREE_SCALE = "5000 counts are one unit of trajectory.txt; the scale of this run is free, so the unit is arbitrary.\n"
+UNKNOWN_SCALE = "5000 counts are one unit of trajectory.txt; the scale of this run is unknown, the unit arbitrary.\n"
 
 
 def write_trajectories(folder: Path, slam: Slam) -> None:
     """Write `trajectory.txt` (every frame) and `keyframes.txt`: TUM format, camera -> world.
 
-    They contain the largest submap, `trajectory-2.txt` and `keyframes-2.txt` the next one, and so on. Files of submaps
-    that have been merged since the last call are removed. For a run in a known map, `map-times.txt` has the times at
-    which the keyframes of the map were recorded.
+    They contain the largest submap; `trajectory-2.txt` and `keyframes-2.txt` contain the next one, and so on. Files of
+    submaps that have been merged since the last call are removed. For a run in a known map, `map-times.txt` has the
+    times at which the keyframes of the map were recorded.
     """
     for name in ("trajectory", "keyframes", "uncertainty"):
         for old in folder.glob(f"{name}-[0-9]*.txt"):
@@ -51,7 +51,7 @@ def write_trajectories(folder: Path, slam: Slam) -> None:
 
 
 def write_uncertainty(path: Path, sigma: PoseUncertainty) -> None:
-    """Write a line per pose: time, standard deviation of position and of orientation, degrees; `nan` = unknown."""
+    """Write the time of each pose, and its standard deviations of position and orientation (deg), NaN if unknown."""
     rows = zip(sigma.timestamps, sigma.translation, np.rad2deg(sigma.rotation), strict=True)
     head = "# timestamp, standard deviation of position, and of orientation in degrees, in the worst direction\n"
     write_text(path, head + "".join(f"{time:.9f} {position:.6f} {angle:.5f}\n" for time, position, angle in rows))
@@ -72,10 +72,10 @@ def submap_file(name: str, rank: int) -> str:
 
 
 def write_depth(folder: Path, depth_maps: Iterable[tuple[int, DepthMap | None]], metric: bool = True) -> None:
-    """Write dense depth of frames, given by number: `depth/NNNNNN.depth.png` (16 bit, 1/5000 m, 0 = unknown),
-    `depth/NNNNNN.confidence.png` (8 bit) and `depth/README.txt`, which describes the format.
+    """Write dense depth of frames, given by number, into `depth/`.
 
-    A frame without depth gets no file. If no frame has depth, warn and write nothing.
+    The files are `NNNNNN.depth.png` (16 bit, 1/5000 m, 0 = unknown), `NNNNNN.confidence.png` (8 bit) and `README.txt`,
+    which describes the format. A frame without depth has no file. If no frame has depth, warn and write nothing.
     """
     written = False
     for frame, depth_map in depth_maps:
@@ -83,14 +83,14 @@ def write_depth(folder: Path, depth_maps: Iterable[tuple[int, DepthMap | None]],
             continue
         written = True
         counts = np.rint(np.nan_to_num(depth_map.depth) * DEPTH_UNIT)
-        counts = np.where(counts <= MAX_COUNT, counts, 0).astype(np.uint16)  # beyond 13.1 m unknown, not clipped
+        counts = np.where(counts <= MAX_COUNT, counts, 0).astype(np.uint16)  # unknown above 13.1 m, not clipped
         confidence = np.rint(255 * depth_map.confidence).astype(np.uint8)
         for name, image in (("depth", counts), ("confidence", confidence)):
             write_picture(folder / "depth" / f"{frame:06d}.{name}.png", image)
     if not written:
-        warn("`depth` is empty: no keyframe has dense depth")
+        warn("no depth was written: no keyframe has dense depth")
         return
-    write_text(folder / "depth" / "README.txt", DEPTH_README + (METRES if metric else FREE_SCALE))
+    write_text(folder / "depth" / "README.txt", DEPTH_README + (METRES if metric else UNKNOWN_SCALE))
 
 
 def write_settings(path: Path, values: Mapping[str, Any]) -> None:

@@ -51,9 +51,9 @@ def evaluate(
     Args:
         estimate: a trajectory, a result, or a path: a file (TUM, KITTI, EuRoC) or a run's folder.
         truth: a trajectory, a sequence with ground truth, or the path of one.
-        options: `max_dt`, the largest difference of two times that match, in seconds; `delta`, the step of the RPE, in
-            matched poses, or by `unit` in "seconds" or "metres" of the true path; `all_pairs`, of every pair that far
-            apart; `vertical`, the direction up in the world of the ground truth.
+        options: `max_dt`, maximum difference of matching times, seconds; `delta`, distance of the two poses of the RPE
+            in matched poses, or with `unit` in "seconds" or "metres" of the true path; `all_pairs`, use all overlapping
+            pairs; `vertical`, upward direction in the world of the ground truth.
 
     Raises:
         InputError: a trajectory is missing, or fewer than three poses match in time.
@@ -79,9 +79,9 @@ def evaluate(
 
 
 def load_estimate(path: Path, truth: Trajectory) -> Trajectory:
-    """Load the trajectory of a file, or of a run's folder; warn if the run is unfinished.
+    """Load a trajectory from a file or a run's folder; warn if the run is unfinished.
 
-    truth: gives the times of poses without times.
+    truth: for the times of poses, if the file has none.
     """
     if unfinished := unfinished_message(path):
         warn(unfinished)
@@ -89,8 +89,9 @@ def load_estimate(path: Path, truth: Trajectory) -> Trajectory:
 
 
 def load_truth(path: Path) -> tuple[Trajectory, bool | None]:
-    """Load the trajectory of a file, or the ground truth of a dataset folder; return it, and whether its lengths are
-    metres: by a run's summary, or by a benchmark's file name; None if unknown.
+    """Load the trajectory of a file, or the ground truth of a dataset folder; also return whether it is in metres.
+
+    This follows from a run's summary, or the file name of a benchmark; None if unknown.
     """
     if path.is_dir():
         sequence = open_sequence(path)

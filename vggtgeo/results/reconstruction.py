@@ -1,4 +1,4 @@
-"""A whole run in one call: frames in, a `Result` out. The command line uses the same function."""
+"""Run the whole system on a sequence with `reconstruct`, which the command line uses, too."""
 
 from __future__ import annotations
 
@@ -50,21 +50,21 @@ from vggtgeo.slam.verdict.judge import check_input, check_refusals, judge_or_rep
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of `vggtgeo.reconstruct` beside the settings of the pipeline.
+    """Options of `vggtgeo.reconstruct` other than the settings of the pipeline.
 
     Fields:
         start: first frame.
         end: frame to stop before; None: after the last.
         stride: take every n-th frame.
-        seed: of the random samples of robust estimators; equal seeds give equal results.
+        seed: of the random samples of robust estimators; runs with equal seeds have equal results.
         dense: source of the dense depth: auto, mvs, sensor, network or none (`vggtgeo/mapping/dense.py`).
         title: of the report; None: the name of the sequence.
-        facts: more entries of the summary.
+        facts: additional entries of the summary.
         warned: earlier warnings about the input, for the verdict and the report.
-        checkpoints: where to write checkpoints, and whether to resume from an existing one.
+        checkpoints: file and interval of checkpoints, and whether to resume from an existing one.
 
     Raises:
-        InputError: a value is invalid; names the field.
+        InputError: a value is invalid.
 
     Example:
         >>> import vggtgeo as vg
@@ -73,7 +73,7 @@ class RunOptions:
         >>> vg.RunOptions(start=5, end=5)
         Traceback (most recent call last):
             ...
-        vggtgeo.io.errors.InputError: `start` is 5 and `end` 5; they must be 0 <= start < end
+        vggtgeo.io.errors.InputError: `end` must be above `start`, got start 5 and end 5
 
     """
 
@@ -115,15 +115,15 @@ def reconstruct(
     callbacks: Iterable[Callback] = (),
     options: RunOptions | None = None,
 ) -> Result:
-    """Track all frames, map them, adjust the whole map, and judge the result.
+    """Track all frames, map them, adjust the whole map, and return the result with its verdict.
 
     Ctrl-C (in a notebook: the stop button) ends the run with the result of the frames so far, and the summary's
-    `interrupted` is true; a second Ctrl-C ends it at once, without a result.
+    `interrupted` is true. A second Ctrl-C ends it at once, without a result.
 
-    Compiled code is cached in the user's cache folder, or in JAX's `jax_compilation_cache_dir` if that is set: the
-    first call takes half a minute longer. `JAX_ENABLE_COMPILATION_CACHE=0` disables the cache.
+    Compiled programs are cached in the user's cache folder, or in JAX's `jax_compilation_cache_dir` if that is set. The
+    first call, which compiles, takes half a minute longer. `JAX_ENABLE_COMPILATION_CACHE=0` disables the cache.
 
-    Python's warnings are per process: if several threads run at once, each result counts the input warnings of all.
+    Python's warnings belong to the process: if several threads run at once, each result has the input warnings of all.
 
     Args:
         frames: a folder or a video file, a sequence (`vggtgeo.read`, `vggtgeo.simulate`), or an iterable of `Frame`,
@@ -134,11 +134,11 @@ def reconstruct(
         camera: of the frames; overrides the calibration of the folder. By default a guess for an iterable.
         known_map: map of `vggtgeo.load_map` to localise in and extend; with the setting `keyframes.localise_only` it
             is not changed.
-        pose_prior: poses that came with the frames, camera -> world at their times, as a prior of the motion:
-            "recorded" for those that the reader knows (they are then no ground truth), a file of poses, or a
-            `Trajectory`. Of another recording, they are noticed and not used.
+        pose_prior: poses to use as a motion prior, camera -> world: "recorded" for the poses of the recording (which is
+            then without ground truth), a file of poses, or a `Trajectory`. Poses of another recording are detected and
+            not used.
         callbacks: called with every frame.
-        options: which frames, the dense map, the report, and checkpoints.
+        options: selection of frames, dense map, report, and checkpoints.
 
     Raises:
         InputError: an argument is invalid, no frame is usable, or the checkpoint belongs to another run.
@@ -157,7 +157,7 @@ def reconstruct(
     settings, options = settings or SlamSettings(), options or RunOptions()
     selection = options.selection
     with program_settings(), interruption() as stop, collected_warnings() as collected:
-        with stop.at_once():  # a live camera may not deliver any frame
+        with stop.at_once():  # without waiting for a frame, which a live camera may never deliver
             source, recorded = with_pose_prior(open_source(frames, camera, settings), pose_prior)
         source.check(*selection)
         perception = _perception(roles, source.has_depth, options.seed, recorded)
@@ -171,15 +171,15 @@ def reconstruct(
             known_map=None if first is None else digest_of_map(first),
         )
         before = load_checkpoint(source.resumable(options.checkpoints), identity)
-        # Corners for the verdict are undistorted by the known map's camera, or later by the one of this run.
-        evidence_camera = source.camera if first is None or first.camera.lens is None else source.camera.pinhole
-        windows, evidence, overlay = WindowRecorder(), CornerRecorder(evidence_camera), StaticOverlaySearch()
-        hooks = RunCallbacks((windows, evidence, overlay, CompileAhead(settings), *callbacks), clock)
+        # Corners for the verdict are undistorted here, or later by the lens of a known map.
+        corner_camera = source.camera if first is None or first.camera.lens is None else source.camera.pinhole
+        windows, corners, overlay = WindowRecorder(), CornerRecorder(corner_camera), StaticOverlaySearch()
+        hooks = RunCallbacks((windows, corners, overlay, CompileAhead(settings), *callbacks), clock)
         with clock.measure("compile"), stop.at_once():
             hooks.warm_up(settings, perception.roles, source.camera)
         if settings.camera.static_overlay and source.repeatable(selection):
             with stop.at_once():
-                perception = _without_overlay(perception, source, selection, hooks, overlay, evidence)
+                perception = _mask_overlay(perception, source, selection, hooks, overlay, corners)
         if first is None and before is None:
             first = _calibrate(source, selection, perception, settings, hooks, stop)
         loop = TrackingLoop(source, selection, perception, settings, hooks, stop, collected, began, before, first)
@@ -191,7 +191,7 @@ def reconstruct(
                 slam, interrupted = _finish(slam, perception.roles, settings, hooks, stop)
         run = {"frames_per_second": round(rate, 2), "interrupted": interrupted}
         facts = {**perception.facts(), **options.facts, **run, **_facts_of_input(source, slam, perception, overlay)}
-        return _conclude(slam, loop, options, facts, (windows, evidence, overlay))
+        return _conclude(slam, loop, options, facts, (windows, corners, overlay))
 
 
 def _facts_of_input(
@@ -212,8 +212,8 @@ def _conclude(
     facts: Mapping[str, Any],
     recorders: tuple[WindowRecorder, CornerRecorder, StaticOverlaySearch],
 ) -> Result:
-    """Build the dense map and, in a thread beside it, the verdict; then the summary."""
-    source, hooks, before, (windows, evidence, overlay) = loop.source, loop.hooks, loop.before, recorders
+    """Build the dense map and, in a parallel thread, the verdict; then the summary."""
+    source, hooks, before, (windows, corners, overlay) = loop.source, loop.hooks, loop.before, recorders
     clock, report = hooks.clock, compare_with_truth(slam, source.truth)
     earlier = 0.0 if before is None else before.whole
     warned = (*options.warned, *(loop.collected if before is None else before.merge_warnings(loop.collected)))
@@ -222,7 +222,7 @@ def _conclude(
     def judge() -> Verdict:
         with clock.measure("verdict (own thread)"):
             of_images = check_refusals(loop.perception.refusals) + overlay.findings()
-            return judge_or_report(slam, evidence.frames, check_input(warned, len(slam.frames)) + of_images)
+            return judge_or_report(slam, corners.frames, check_input(warned, len(slam.frames)) + of_images)
 
     hooks.each("on_stage", "dense map and verdict")
     return_freed_memory()
@@ -254,19 +254,19 @@ def _conclude(
 
 
 def _first_state(known: Slam | None, source: Source, settings: SlamSettings, roles: Roles) -> Slam | None:
-    """Return the state before the first frame in a known map.
+    """Return the state before the first frame of a run in a known map; None without a map.
 
-    Raise InputError if it is missing, or has another camera or matcher.
+    Raises InputError if a needed map is missing, or the map has another camera or matcher.
     """
     if known is not None:
         if source.has_depth and not known.metric:
             warn(
-                "`known_map` has a free scale (it was made without depth), so the metric depth of these frames is not "
-                "used; start a new map for a metric one"
+                "`known_map` has an unknown scale (it was made without depth), so the metric depth of these frames is "
+                "not used; start a new map for a metric one"
             )
         return entered(known, source.camera, roles.points)
     if settings.keyframes.localise_only:
-        raise InputError("`keyframes.localise_only` needs a map: pass `known_map` (`--map FILE`)")
+        raise InputError("`known_map` (`--map FILE`) must be given with `keyframes.localise_only`, got None")
     return None
 
 
@@ -280,7 +280,7 @@ def _calibrate(
 ) -> Slam | None:
     """Self-calibrate an unknown camera on the first frames; return the state before the first frame, or None.
 
-    Warnings and refusals are restored: the run itself reports them.
+    Warnings are ignored and counts of refusals restored, since the run on the same frames reports them.
     """
     start, _, stride = selection
     count = min(source.count(*selection) or 0, CALIBRATION_FRAMES)
@@ -311,21 +311,21 @@ def _calibrate(
     return found
 
 
-def _without_overlay(
+def _mask_overlay(
     perception: Perception,
     source: Source,
     selection: tuple[int, int | None, int],
     hooks: RunCallbacks,
     overlay: StaticOverlaySearch,
-    evidence: CornerRecorder,
+    corners: CornerRecorder,
 ) -> Perception:
-    """Search for a static overlay; mask it in perception and in the verdict's evidence."""
+    """Search for a static overlay; mask it in perception and in the corners for the verdict."""
     hooks.each("on_stage", "searching for a static overlay in the images")
     with hooks.clock.measure("static overlay"):
         overlay.search(source, selection)
     if overlay.found is None:
         return perception
-    evidence.leave_out(overlay.found.mask)
+    corners.leave_out(overlay.found.mask)
     return replace(perception, roles=replace(perception.roles, static_overlay=overlay.found))
 
 

@@ -1,4 +1,4 @@
-"""The result of a run: trajectory, map and verdict, from the last state or from a folder; its figure and view."""
+"""Represent the result of a run, from its last state or from a folder; save it, draw it, and show it in 3D."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ from vggtgeo.slam.verdict.findings import Verdict
 from vggtgeo.slam.verdict.judge import judge
 
 DepthChoice = bool | Literal["every"]
-"""Which depth images to save: none, those of the keyframes, or those of every frame."""
+"""Depth images to save: none, those of the keyframes, or those of every frame."""
 NOTEBOOK_POINTS = 150_000
-"""Of a view in a notebook, which keeps it in its file, some 3 MB."""
+"""Default points of a view in a notebook, whose file then grows by about 3 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class Result:
         cloud: the map, world frame.
         intrinsics: adjusted fx, fy, cx, cy, pixels, of the undistorted images at the size of the keyframes.
         metric: whether lengths are metres; without metric depth they have no unit.
-        verdict: how far the result can be trusted, by segment of time.
+        verdict: whether the result is good, degraded or failed, with reasons, for the run and its segments.
         summary: counts, times and settings, as in `summary.json`.
         record: the data of the run; None for a result loaded from a folder.
         saved_mesh: the mesh loaded from a folder, if any.
@@ -115,7 +115,7 @@ class Result:
     def of(cls, slam: Slam, evidence: CornerTracks = (), truth: Trajectory | None = None, dense: str = "auto") -> Self:
         """Return the result of a state of `vggtgeo.run` or `vggtgeo.finish`.
 
-        evidence: frame data of a `CornerRecorder`; without it the verdict uses the state alone. truth: ground truth,
+        evidence: frame data of a `CornerRecorder`; without it the verdict uses the state only. truth: ground truth,
         camera -> world. dense: source of the dense depth, as in `vggtgeo.RunOptions`.
         """
         check_kind("slam", slam, Slam, "a state of `vggtgeo.run`")
@@ -166,29 +166,29 @@ class Result:
         """Write the folder of a run; `vggtgeo.read` loads it.
 
         Files: `trajectory.txt`, `keyframes.txt`, `map.ply`, `mesh.ply` (with dense depth), `images/`, `scene.npz`,
-        `trajectory.png`, `report.html`, `summary.json`, `settings.toml`. They replace those of an earlier run all at
-        once. A checkpoint in the folder is kept, with a warning. A result loaded from a folder has no images and no
-        record of its windows: it is saved without images, report and depth.
+        `trajectory.png`, `report.html`, `summary.json`, `settings.toml`. They replace the files of an earlier run when
+        all are complete. A checkpoint in the folder is kept, with a warning. A result that was loaded from a folder is
+        saved without images, report and depth, since only a result in memory has their data.
 
         Args:
             folder: created if it does not exist.
             depth: also write dense depth and confidence: True for keyframes; "every" for every frame, from the sensor
                 if `frames` have depth, else from the nearest keyframes, and the images of `frames`.
-            frames: what the run read; needed for depth and images of frames that are not keyframes.
-            settings: options of the command line, saved beside the pipeline's own settings.
+            frames: the frames that the run read; needed for depth and images of frames that are not keyframes.
+            settings: options of the command line, saved with the settings of the pipeline.
 
         Returns:
             The content of `summary.json`: the summary, with the writing time for a run.
 
         Raises:
-            InputError: the image size of `frames` differs from the run's; `depth` is invalid, or asked of a result
-                loaded from a folder; `settings` are not plain values; or the folder is not writable, in use by a run,
-                or contains images of a sequence.
+            InputError: the image size of `frames` differs from the run's; `depth` is invalid, or requested from a
+                result loaded from a folder; `settings` are not plain values; or the folder is not writable, in use by a
+                run, or contains images of a sequence.
 
         """
         if not (depth == "every" or isinstance(depth, bool | np.bool_)):
             raise InputError(f"`depth` must be True, False or 'every', got {depth!r:.60}")
-        check_kind("frames", frames, Sequence | None, "what the run read, for example of `vggtgeo.open_sequence`")
+        check_kind("frames", frames, Sequence | None, "a sequence, as of `vggtgeo.open_sequence`")
         check_plain("settings", settings or {})
         with open_folder_for_result(path_of("folder", folder)) as place:
             return self.save_into(place, depth=depth, frames=frames, settings=settings)
@@ -201,10 +201,10 @@ class Result:
         frames: Sequence | None = None,
         settings: Mapping[str, Any] | None = None,
     ) -> dict[str, Any]:
-        """Write the folder as `save`, into one that is locked already."""
+        """Write the folder as `save`, into a folder that is already locked."""
         place = run.stage
         if depth and self.record is None:
-            raise InputError("`depth` needs a result of a run in memory; this one was loaded from a folder")
+            raise InputError(f"`depth` must be False for a result loaded from a folder, got {depth!r}")
         began = time.perf_counter()
         run.release_reserve()
         used = {**(settings or {}), **self.summary.get("settings", {})}
@@ -218,7 +218,7 @@ class Result:
             self.keyframes.save_tum(place / "keyframes.txt")
             if self.saved_uncertainty is not None:
                 write_uncertainty(place / "uncertainty.txt", self.saved_uncertainty)
-        with ThreadPoolExecutor(1, thread_name_prefix="mesh") as pool:  # mesh and report take equally long
+        with ThreadPoolExecutor(1, thread_name_prefix="mesh") as pool:  # parallel to the report, which takes as long
             meshed = pool.submit(self._save_mesh, place / "mesh.ply")
             self.cloud.save_ply(place / "map.ply")
             self._draw(place, run.folder.resolve().name, {**plain, "settings": flags}, meshed.result)
@@ -320,14 +320,14 @@ def _plot(value: Result, truth: Trajectory | None = None) -> NotebookFigure:
 
 
 def show(result: Result, truth: Trajectory | None = None, *, max_points: int = NOTEBOOK_POINTS) -> MapView:
-    """Return a 3D view of a result: a notebook displays it, and its `save(path)` writes a page.
+    """Return a 3D view of a result, which a notebook displays and `save(path)` writes as a page.
 
-    The view has the coloured map, the mesh, the camera path with its uncertainty, and the keyframes; a click on a
+    The view has the coloured map, the mesh, the camera path with its uncertainty, and the keyframes. A click on a
     keyframe shows its image. A result loaded from a folder has no images.
 
     Args:
         result: of `vggtgeo.reconstruct` or `vggtgeo.read`, with at least one pose.
-        truth: ground truth, camera -> world, aligned and shown beside the path; by default that of the run.
+        truth: ground truth, camera -> world, shown after alignment; by default that of the run.
         max_points: of the view; a larger map is decimated.
 
     Raises:
@@ -341,11 +341,11 @@ def show(result: Result, truth: Trajectory | None = None, *, max_points: int = N
         True
 
     """
-    check_kind("result", result, Result, "of `vggtgeo.reconstruct` or `vggtgeo.read`")
-    check_kind("truth", truth, Trajectory | None, "for example of `sequence.ground_truth()`")
+    check_kind("result", result, Result, "a `Result`, as of `vggtgeo.reconstruct` or `vggtgeo.read`")
+    check_kind("truth", truth, Trajectory | None, "a `Trajectory`, as of `sequence.ground_truth()`")
     check_viewer()
     if not len(result.trajectory):
-        raise InputError("`result` has no pose: no frame was tracked, and there is no map to show")
+        raise InputError("`result` must have at least one pose, got none: no frame was tracked")
     record = result.record
     own = truth if truth is not None or record is None else record.truth
     return MapView.of(result._scene(result.mesh, own, max_points), "map")

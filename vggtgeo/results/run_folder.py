@@ -1,12 +1,12 @@
-"""The output folder of a run: locked before the first frame, published at the end, never a mixture of two runs.
+"""Manage the output folder of a run, which never has a mixture of files of two runs.
 
-A run writes to `FOLDER/unfinished/`; the files of an earlier run stay. `publish` then removes the old files, the
-summary first, and moves the new ones in, the summary last. These are renames within one file system, and signals are
-deferred. If the process is killed between two of them, the folder has files of one run only and no summary, and
-`unfinished/` exists.
+The folder is locked before the first frame. A run writes into `FOLDER/unfinished/`, while the files of an earlier run
+stay. At the end `publish` removes the old files, the summary first, and moves the new ones, the summary last. These
+are renames within one file system, and signals are deferred. If the process is killed between two renames, the folder
+has files of one run only and no summary, and `unfinished/` exists.
 
-The checkpoint (`checkpoints.py`) is there too, and outlives a run that does not publish: `resume` of the next run
-decides whether it is used or deleted, and is required.
+`unfinished/` also has the checkpoint (`checkpoints.py`), which stays if the run does not publish. The next run must
+then state with `resume` whether it is used or deleted.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from pathlib import Path
 from vggtgeo.io.errors import InputError, warn
 from vggtgeo.io.files import locked_folder, not_written, write_text
 from vggtgeo.io.process import interruption
-from vggtgeo.results.checkpoints import frames_kept
-from vggtgeo.results.output_checks import CHECKPOINT, NAMES, NOTE, SUMMARY, UNFINISHED, check_output
+from vggtgeo.results.checkpoints import frame_count_text
+from vggtgeo.results.output_checks import CHECKPOINT, README, RUN_FILES, SUMMARY, UNFINISHED, check_output
 
 RESERVE = 96 * 2**20
-"""Bytes reserved on the disk until the results are written: a map of 500,000 points (14 MB), a mesh of a million faces
-(30 MB), 200 images (20 MB), report with its 3D view and trajectories of 10,000 frames (25 MB)."""
+"""Bytes of the disk that are reserved for the results: a map of 500,000 points (14 MB), a mesh of a million faces
+(30 MB), 200 images (20 MB), a report with 3D view and trajectories of 10,000 frames (25 MB)."""
 
 _LOCK = ".lock"
 _RESERVED = ".reserve"
@@ -37,15 +37,15 @@ _RESERVED = ".reserve"
 class RunFolder:
     """A locked output folder: write into `stage`, then call `publish`.
 
-    keeps: whether the checkpoint in `stage` belongs to another run, so that `publish` must not remove it.
+    keeps_checkpoint: whether the checkpoint in `stage` belongs to another run, so that `publish` must not remove it.
     """
 
     folder: Path
-    keeps: bool = False
+    keeps_checkpoint: bool = False
 
     @property
     def stage(self) -> Path:
-        """Folder for the files until all are complete."""
+        """Temporary folder for the files until all are complete."""
         return self.folder / UNFINISHED
 
     @property
@@ -61,50 +61,50 @@ class RunFolder:
         """Replace the files of an earlier run by those in `stage`; signals are deferred until it is done."""
         with interruption():
             self.release_reserve()
-            # File managers and network file systems leave hidden files.
-            ours = (path for path in self.stage.iterdir() if not path.name.startswith("."))
-            written = (path for path in ours if path.name not in (CHECKPOINT, NOTE))
+            # Hidden files are left by file managers and network file systems.
+            visible = (path for path in self.stage.iterdir() if not path.name.startswith("."))
+            written = (path for path in visible if path.name not in (CHECKPOINT, README))
             new = sorted(written, key=lambda path: path.name == SUMMARY)
-            for pattern in NAMES:
+            for pattern in RUN_FILES:
                 for path in sorted(self.folder.glob(pattern)):
                     _remove(path)
             for path in new:
                 os.replace(path, self.folder / path.name)
-            if not self.keeps:
+            if not self.keeps_checkpoint:
                 self.checkpoint.unlink(missing_ok=True)
 
 
 @contextmanager
 def open_folder_for_result(folder: str | os.PathLike[str]) -> Iterator[RunFolder]:
-    """Lock a folder as `open_run_folder`, for a result that was made elsewhere.
+    """Lock a folder as `open_run_folder`, to save a result in memory.
 
-    A checkpoint of a killed run in that folder is kept, with a warning: it may have taken hours to compute.
+    A checkpoint of a killed run in that folder is kept, with a warning, since it may have taken hours to compute.
     """
     checkpoint = RunFolder(Path(folder)).checkpoint
     with open_run_folder(folder, resume=True) as place:
-        keeps = checkpoint.is_file()
-        if keeps:
+        keeps_checkpoint = checkpoint.is_file()
+        if keeps_checkpoint:
             warn(
                 f"`{folder}` contains the checkpoint of a killed run, which is kept; `vggtgeo run --resume` continues "
                 "that run and replaces the files of this result"
             )
-        yield replace(place, keeps=keeps)
+        yield replace(place, keeps_checkpoint=keeps_checkpoint)
 
 
 @contextmanager
 def open_run_folder(
     folder: str | os.PathLike[str], source: Path | None = None, reserve: int = 0, resume: bool | None = False
 ) -> Iterator[RunFolder]:
-    """Lock a folder for one run; its files stay as they are until `publish`.
+    """Lock a folder for one run; its files are unchanged until `publish`.
 
-    Without `publish`, `unfinished/` and every folder made for it are removed again, unless `unfinished/` has poses (the
-    disk was full when the results were written, for example) or a checkpoint.
+    Without `publish`, `unfinished/` and all folders made for it are removed again, unless `unfinished/` has poses (for
+    example because the disk was full when the results were written) or a checkpoint.
 
     Args:
         folder: created if it does not exist.
         source: file or folder that the run reads.
         reserve: bytes of disk space to reserve for the results.
-        resume: whether to keep (else delete) the checkpoint of a killed run; None: there must not be one.
+        resume: whether to keep (else delete) the checkpoint of a killed run; None: a checkpoint is an error.
 
     Raises:
         InputError: the folder is not writable, is in use by another run, contains images, or contains a checkpoint
@@ -120,8 +120,8 @@ def open_run_folder(
             try:
                 if resume is None and run.checkpoint.is_file():
                     raise InputError(
-                        f"`{place}` contains a run that was killed after {frames_kept(run.checkpoint)}: add `--resume` "
-                        "to continue it, or `--no-resume` to start again"
+                        f"`{place}` contains a run that was killed after {frame_count_text(run.checkpoint)}: add "
+                        "`--resume` to continue it, or `--no-resume` to start again"
                     )
                 _prepare(run, reserve, bool(resume))
                 yield run
@@ -135,7 +135,7 @@ def open_run_folder(
 
 
 def _prepare(run: RunFolder, reserve: int, resume: bool) -> None:
-    """Make the stage: empty except for the checkpoint to resume from, with a note and the reserved space."""
+    """Prepare the stage: remove all but the checkpoint to resume from, write a README, and reserve disk space."""
     try:
         kept = [run.checkpoint] if resume and run.checkpoint.is_file() else []
         for path in run.stage.iterdir() if kept else [run.stage]:
@@ -143,14 +143,14 @@ def _prepare(run: RunFolder, reserve: int, resume: bool) -> None:
                 _remove(path)
         run.stage.mkdir(exist_ok=True)
         write_text(
-            run.stage / NOTE,
-            "Files of a run that is still going on, or was killed. Files in the folder above are of the run before.\n",
+            run.stage / README,
+            "Files of a run that is not finished, or was killed. The folder above has the files of the previous run.\n",
         )
         if reserve and hasattr(os, "posix_fallocate"):
             with (run.stage / _RESERVED).open("wb") as file:
                 os.posix_fallocate(file.fileno(), 0, reserve)
     except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # of a file system that reserves no space
+        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # the file system cannot reserve space
             raise not_written(run.folder, error, reserve) from None
 
 

@@ -1,7 +1,7 @@
-"""Images, cameras and tracks of a run's views, for export to other programs; depth of its frames.
+"""Write images, cameras and tracks of a run's views, for export to other programs; compute the depth of its frames.
 
-Views are the keyframes, or all frames. Files: `scene.npz`, `images/`, and `image-mask.png` if the undistorted images
-have invalid borders.
+Views are the keyframes, or all frames. The files are `scene.npz`, `images/`, and `image-mask.png` if the undistorted
+images have invalid borders.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from vggtgeo.slam.threads import map_in_threads
 MASK = "image-mask.png"
 JPEG_QUALITY = 95
 BATCH = 16
-"""Frames in memory at a time: a run keeps images of its keyframes only, so others are read a second time."""
+"""Number of frames in memory at a time. A run keeps the images of its keyframes only, so others are read again."""
 
 
 def image_name(frame: int) -> str:
@@ -46,8 +46,8 @@ class Scene:
     """Views of a map: its keyframes, and other frames whose images were written.
 
     Fields: frames int [k], frame number of each view; timestamps float64 [k], s; poses float64 [k, 4, 4],
-    world -> camera; intrinsics float64 [4], pixels, of the undistorted images; size (width, height); tracks, whose
-    view numbers index these arrays; metric: whether lengths are metres.
+    world -> camera; intrinsics float64 [4], pixels, of the undistorted images; size (width, height); tracks, whose view
+    numbers index these arrays; metric, whether lengths are metres.
     """
 
     frames: np.ndarray
@@ -60,7 +60,7 @@ class Scene:
 
     @classmethod
     def of(cls, slam: Slam) -> Scene:
-        """Return the scene of the largest submap, as `map.ply`: the pose of other submaps relative to it is unknown.
+        """Return the scene of the largest submap, the one in `map.ply`, since the poses relative to others are unknown.
 
         `slam` must have a keyframe.
         """
@@ -83,8 +83,9 @@ class Scene:
         return image_name(int(self.frames[view]))
 
     def with_frames(self, others: Sequence[tuple[int, float, np.ndarray]]) -> Scene:
-        """Return the scene with more views, which observe no points; each is (frame number, time in s, pose
-        world -> camera). Views are sorted by frame number.
+        """Return the scene with more views, sorted by frame number; each is (frame number, time in s, pose).
+
+        Poses are world -> camera. The new views observe no points.
         """
         if not others:
             return self
@@ -117,8 +118,8 @@ def _largest_submap(slam: Slam) -> tuple[Keyframe, ...]:
 def write_scene(folder: Path, slam: Slam, valid: np.ndarray | None = None, frames: Frames | None = None) -> None:
     """Write `scene.npz` and the undistorted image of each keyframe in `images/`, each atomically.
 
-    valid: bool [H, W], pixels of the undistorted images inside the original one; saved as `image-mask.png`, white where
-    valid. frames: what the run read, to write the image of every frame of the same submap as well.
+    valid: bool [H, W], pixels of the undistorted images that the original images cover; saved as `image-mask.png`,
+    white if valid. frames: the frames that the run read, to write the image of every frame of the same submap, too.
     """
     scene = Scene.of(slam)
     for view, keyframe in enumerate(_largest_submap(slam)):
@@ -159,12 +160,12 @@ def reread_frames(slam: Slam, frames: Frames) -> Iterator[tuple[int, Frame]]:
     height, width = slam.keyframes[0].size
     if (frames.camera.width, frames.camera.height) != (width, height):
         raise InputError(
-            f"`frames` has images of {frames.camera.width} x {frames.camera.height} pixels, the run's are "
-            f"{width} x {height}; pass the frames that the run read"
+            f"`frames` must have images of {width} x {height} pixels as in the run, got {frames.camera.width} x "
+            f"{frames.camera.height}: pass the frames that the run read"
         )
     numbers = sorted(row_of)
     stride = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
-    with warnings.catch_warnings():  # the run has reported unreadable frames already
+    with warnings.catch_warnings():  # of unreadable frames, which the run has reported
         warnings.simplefilter("ignore", InputWarning)
         for frame in frames.frames(numbers[0], numbers[-1] + 1, stride):
             if frame.index in row_of:
@@ -174,13 +175,13 @@ def reread_frames(slam: Slam, frames: Frames) -> Iterator[tuple[int, Frame]]:
 def depth_of_frames(
     slam: Slam, depth_maps: Sequence[DepthMap | None], frames: Frames | None = None
 ) -> Iterator[tuple[int, DepthMap | None]]:
-    """Yield frame number and depth of every frame, in the order of frames; see `FrameDepths`.
+    """Yield frame number and depth of every frame, in order; see `FrameDepths`.
 
     Args:
         slam: state after the last adjustment.
         depth_maps: dense depth of the keyframes.
-        frames: what the run read. Its depth images are undistorted as in the run and get the noise of a depth camera;
-            keyframe depth fills the rest. None: keyframe depth only.
+        frames: the frames that the run read. Their depth images are undistorted as in the run and get the noise model
+            of a depth camera; depth of keyframes fills the holes. None: depth of keyframes only.
 
     Raises:
         InputError: the image size of `frames` differs from that of the run.
@@ -193,15 +194,15 @@ def depth_of_frames(
 
 
 def _sensor_depths(slam: Slam, frames: Frames | None) -> Iterator[tuple[int, DepthMap | None]]:
-    """Yield rows of `slam.frames`, each with the frame's depth image, undistorted."""
-    left = set(range(len(slam.frames)))
+    """Yield all rows of `slam.frames`, each with the frame's undistorted depth image, if it has one."""
+    unread = set(range(len(slam.frames)))
     if frames is not None and frames.has_depth and slam.metric:
         undistorter, sensor = (slam.camera.lens or frames.camera).undistorter(), SensorDepth()
         for row, frame in reread_frames(slam, frames):
-            left.remove(row)
+            unread.remove(row)
             depth = None
             if frame.depth is not None:
                 found = sensor.estimate(frame.image, undistorter.depth(frame.depth))
                 depth = DepthMap(found.depth, found.sigma_rel, found.confidence)
             yield row, depth
-    yield from ((row, None) for row in sorted(left))
+    yield from ((row, None) for row in sorted(unread))

@@ -1,6 +1,4 @@
-"""The input of a run: a folder, a file, a sequence or a stream of images; opened, validated, reduced in size; the poses
-that it is given as a prior; and a static overlay of its images.
-"""
+"""Open and validate the input of a run, reduce its images, read its pose prior, and find static overlays."""
 
 from __future__ import annotations
 
@@ -43,17 +41,18 @@ from vggtgeo.slam.verdict.findings import Finding
 from vggtgeo.slam.verdict.judge import check_static_overlay
 
 MIN_SIDE = 32
-"""Pixels: the windows of features and of the image pyramid need as many."""
+"""Minimum pixels of a side of an image: the windows of features and of the image pyramid need them."""
 RECORDED = "recorded"
+"""Value of `pose_prior` for the poses of the recording."""
 PosePrior = str | os.PathLike[str] | Trajectory | None
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Frames for the estimator and, apart from them, the ground truth for the evaluation.
+    """Frames for the estimator, and separately the ground truth for the evaluation.
 
     read: camera of the images before they were reduced. simulated: whether frames are rendered. truth_in_metres:
-    whether the ground truth is metric; poses of COLMAP have a free scale.
+    whether the ground truth is metric; poses of COLMAP have an unknown scale.
     """
 
     name: str
@@ -77,17 +76,15 @@ class Source:
         return None if isinstance(self.frames, FrameStream) else len(self.frames) or None
 
     def check(self, start: int, end: int | None, stride: int) -> None:
-        """Raise InputError for an invalid selection, or images too small for features, before anything is compiled."""
+        """Raise InputError for an invalid selection, or for images that are too small for features."""
         if min(self.camera.width, self.camera.height) < MIN_SIDE:
             size, read = (f"{camera.width} x {camera.height}" for camera in (self.camera, self.read))
-            smaller = "" if size == read else f", {size} after they were reduced"
-            raise InputError(
-                f"the images of `{self.name}` are {read} pixels{smaller}; both sides must be at least {MIN_SIDE}"
-            )
+            smaller = "" if size == read else f", reduced to {size}"
+            raise InputError(f"the images of `{self.name}` must have sides of {MIN_SIDE} pixels, got {read}{smaller}")
         check_selection(self.name, self.length or sys.maxsize, start, end, stride)
 
     def identity(self, selection: tuple[int, int | None, int]) -> dict[str, Any]:
-        """Return what distinguishes this source from others before a frame is read."""
+        """Return the properties that identify this source without reading a frame."""
         size = f"{self.camera.width} x {self.camera.height}"
         return {
             **{"name": self.name, "frames": self.length, "size": size, "camera": self.camera},
@@ -95,27 +92,28 @@ class Source:
         }
 
     def resumable(self, asked: Checkpoints | None) -> Checkpoints | None:
-        """Return `asked`; raise InputError if it resumes a stream, whose frames cannot be read again."""
+        """Return `asked`; raise InputError if it would resume a stream, whose frames cannot be read again."""
         if asked is not None and asked.resume and self.length is None:
-            raise InputError(f"`{self.name}` is a stream, whose frames cannot be read again: it cannot be resumed")
+            raise InputError(f"`resume` must be False for a stream, whose frames cannot be read again: `{self.name}`")
         return asked
 
     def repeatable(self, selection: tuple[int, int | None, int]) -> bool:
-        """Return whether frames can be read before the run; simulated frames are too slow to render twice."""
+        """Return whether frames can be read before the run; rendering simulated frames twice would be too slow."""
         return bool(self.count(*selection)) and not self.simulated
 
     def sample_images(
         self, start: int, end: int | None, stride: int, max_images: int, max_step: int
     ) -> list[UInt8[np.ndarray, "h w 3"]]:
-        """Return up to `max_images` of the first images of a selection, every `max_step` frames or less; none of a
-        stream.
+        """Return up to `max_images` of the first images of a selection, at most `max_step` frames apart.
+
+        The list is empty for a stream.
         """
         count = self.count(start, end, stride)
         if not count or isinstance(self.frames, FrameStream):
             return []
         step = max(min(max_step, count // max_images), 1)
         until = start + min(count, max_images * step) * stride
-        # The run itself reports invalid frames.
+        # Invalid frames are reported by the run.
         with warnings.catch_warnings(), suppress(InputError):
             warnings.simplefilter("ignore", InputWarning)
             frames = SequenceView(self.frames, self.camera, False).frames(start, until, step * stride)
@@ -139,7 +137,7 @@ def open_source(
     if not isinstance(frames, Sequence):
         stream = frame_stream(frames, camera)
         return Source("frames", reduced(stream, max_pixels), None, stream.camera)
-    name = frames.name.encode("utf-8", "replace").decode()  # a folder's name may be no UTF-8
+    name = frames.name.encode("utf-8", "replace").decode()  # a folder's name need not be UTF-8
     view = SequenceView(frames, camera or frames.camera, frames.has_depth, has_truth=False)
     simulated = isinstance(frames, SyntheticSequence)
     truth, metres = _truth(frames), getattr(frames, "truth_in_metres", True)
@@ -147,20 +145,20 @@ def open_source(
 
 
 def _truth(sequence: Sequence) -> Trajectory | None:
-    """Return the ground truth; warn and return None if it cannot be read, since the run itself does not need it."""
+    """Return the ground truth; None, with a warning, if it cannot be read, since the run does not need it."""
     try:
         truth = sequence.ground_truth()
         if truth is not None and not getattr(sequence, "truth_in_metres", True):
-            text = "has a free scale: errors are in its own unit, after Sim(3) alignment"
+            text = "has an unknown scale: errors are in its own unit, after Sim(3) alignment"
             warn(f"the ground truth of `{sequence.name}` {text}", NoteWarning)
         return truth
     except InputError as error:
-        warn(f"the ground truth is invalid and is left out: {error}")
+        warn(f"the ground truth is invalid and not used: {error}")
         return None
 
 
 def reduction_summary(source: Source, slam: Slam) -> dict[str, Any]:
-    """Return the summary's entries on reduced images: both sizes, and the camera of the original ones."""
+    """Return the summary's entries on reduced images: both sizes, and the camera of the original images."""
     size, read = (f"{camera.width} x {camera.height}" for camera in (source.camera, source.read))
     if size == read:
         return {}
@@ -173,7 +171,7 @@ def reduction_summary(source: Source, slam: Slam) -> dict[str, Any]:
 
 
 def with_pose_prior(source: Source, given: PosePrior) -> tuple[Source, RecordedPoses | None]:
-    """Return the source and the prior; poses of the recording are its prior or its ground truth, never both.
+    """Return the source and the pose prior; poses of the recording are either the prior or the ground truth.
 
     Raises InputError if the source has no recorded poses, or the file cannot be read.
     """
@@ -191,16 +189,16 @@ def with_pose_prior(source: Source, given: PosePrior) -> tuple[Source, RecordedP
         return source, RecordedPoses(load_trajectory(Path(given)))
     if source.truth is None:
         raise InputError(
-            f"`pose_prior` is 'recorded', but `{source.name}` has no recorded poses; give a file of poses (`timestamp "
-            "tx ty tz qx qy qz qw`), or None"
+            f"`pose_prior` must not be 'recorded' for `{source.name}`, which has no recorded poses; give a file of "
+            "poses (`timestamp tx ty tz qx qy qz qw`), or None"
         )
     return replace(source, truth=None), RecordedPoses(source.truth, metres=source.truth_in_metres)
 
 
 class StaticOverlaySearch(Callback):
-    """Finds the static overlay of a run's images, and gives the verdict its findings.
+    """Finds a static overlay in the images of a run, for perception and for the verdict.
 
-    found: the mask to leave out of perception; None before `search`, and where no overlay is certain.
+    found: the overlay that perception masks; None before `search`, and if no overlay is certain.
     """
 
     def __init__(self) -> None:
@@ -213,7 +211,7 @@ class StaticOverlaySearch(Callback):
         self._frames = 0
 
     def search(self, source: Source, selection: tuple[int, int | None, int]) -> None:
-        """Search in a sample of the first frames, before the run; warn where an overlay is left out."""
+        """Search in a sample of the first frames, before the run; warn of an overlay that is masked."""
         self._searched = True
         self._overlay = find_static_overlay(source.sample_images(*selection, MAX_IMAGES, STRIDE))
         if self._overlay is None or not self._overlay.separable:
@@ -225,7 +223,7 @@ class StaticOverlaySearch(Callback):
         )
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
-        """Keep 20 to 40 images, evenly spread over at most the first `MAX_IMAGES * STRIDE` frames."""
+        """Keep 20 to 40 images, evenly spaced over at most the first `MAX_IMAGES * STRIDE` frames."""
         if self._searched or self._frames >= MAX_IMAGES * STRIDE:
             return
         if self._frames % self._stride == 0:

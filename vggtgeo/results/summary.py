@@ -1,4 +1,4 @@
-"""The summary of a run, as written to `summary.json`."""
+"""Make the summary of a run, as written to `summary.json`."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ def summarise(
 ) -> dict[str, Any]:
     """Return verdict, settings, versions, counts, time by stage, final intrinsics, and errors against the ground truth.
 
-    truth_in_metres: whether lengths of the ground truth are metres; written as `in_metres` beside the errors. recorded:
-    whether recorded poses were used as a prior, which then give a map without depth its unit.
+    truth_in_metres: whether lengths of the ground truth are metres; written as `in_metres` with the errors. recorded:
+    whether recorded poses were used as a prior, whose unit is then that of a map without depth.
     """
     tracked = sum(record.tracked for record in slam.frames)
     values: dict[str, Any] = {
@@ -95,7 +95,7 @@ def _pose_sigma(slam: Slam) -> dict[str, Any]:
 def list_submaps(slam: Slam) -> list[dict[str, Any]]:
     """Return file, first and last frame, number of poses and of keyframes of each submap, the largest first.
 
-    No factor connects two submaps, so that their relative pose and scale are unknown.
+    Submaps are not connected by factors, so their relative poses and scales are unknown.
     """
     found = []
     for rank, numbers in enumerate(submaps_by_size(slam)):
@@ -108,7 +108,7 @@ def list_submaps(slam: Slam) -> list[dict[str, Any]]:
 
 
 def add_writing_time(summary: Mapping[str, Any], seconds: float) -> dict[str, Any]:
-    """Return the summary with the stage `write` of `seconds`, and the frames per second of the whole run.
+    """Add the stage `write` of `seconds` to the summary, and the frames per second of the whole run.
 
     A summary without times is returned unchanged.
     """
@@ -129,7 +129,7 @@ SCALE_BASIS = "depth only: a constant factor on the depth cannot be observed in 
 
 
 def scale_name(slam: Slam, verdict: Verdict, recorded: bool) -> str:
-    """Return the kind of scale; "metric" only if no check of the verdict doubts it."""
+    """Return the kind of scale; it is "metric" only if no check of the verdict contradicts it."""
     if not slam.metric:
         unit = "lengths are in the unit of the recorded poses" if recorded else "lengths have no unit"
         return f"free (no metric depth): {unit}"

@@ -1,4 +1,4 @@
-"""The loop over the frames of a run and its callbacks: track, write checkpoints, stop after a whole frame."""
+"""Loop over the frames of a run: track each, call the callbacks, write checkpoints, stop after a whole frame."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from vggtgeo.slam.window.sliding_window import warm_up
 
 
 class PendingFrames:
-    """Frames between the reading thread and the loop, which takes each, as read, once it is tracked.
+    """Frames that a thread has read and the loop has not yet tracked, so that callbacks get each frame as read.
 
-    `deque.append` and `popleft` are atomic, so no lock is needed.
+    A lock is not needed: `deque.append` and `popleft` are atomic.
     """
 
     def __init__(self, frames: Iterable[Frame]) -> None:
@@ -54,10 +54,10 @@ class PendingFrames:
 
 @dataclass(frozen=True, eq=False)
 class TrackingLoop:
-    """The loop over frames.
+    """The loop over the frames of a run.
 
     collected: warnings so far. began: start of the run, s. before: the run that this one resumes. first: the state
-    before the first frame, if there is a map.
+    before the first frame, None for an empty map.
     """
 
     source: Source
@@ -75,8 +75,9 @@ class TrackingLoop:
     def checkpoint_writer(
         self, asked: Checkpoints | None, identity: Mapping[str, str]
     ) -> Iterator[CheckpointWriter | None]:
-        """Yield a writer of checkpoints, None if they are not asked for or the frames are a stream; wait for its last
-        file at the end.
+        """Yield a writer of checkpoints, and at the end wait for its last file.
+
+        It is None if checkpoints are not requested, or the frames are a stream.
         """
         if asked is None or self.source.count(*self.selection) is None:
             yield None
@@ -91,7 +92,7 @@ class TrackingLoop:
     def track(self, writer: CheckpointWriter | None) -> tuple[Slam, bool, float]:
         """Track all frames; return the state after the last one, whether Ctrl-C ended the loop, and frames per second.
 
-        Ctrl-C ends the loop after a whole frame, or at once while it waits for one.
+        Ctrl-C ends the loop after the current frame, or at once if the loop waits for a frame.
         """
         known = self.first if self.before is None else self.before.slam
         slam, frame, interrupted = known, None, False
@@ -117,7 +118,7 @@ class TrackingLoop:
         if slam is None or not slam.frames:
             if interrupted:
                 raise KeyboardInterrupt
-            raise InputError(f"`{self.source.name}` has no usable frame; nothing was written")
+            raise InputError(f"`{self.source.name}` must have at least one valid frame, got none; nothing was written")
         if interrupted:
             self._message("interrupted: keeping the frames so far")
         elif writer is not None:
@@ -127,7 +128,7 @@ class TrackingLoop:
         return slam, interrupted, len(slam.frames) / (earlier + time.perf_counter() - began)
 
     def _frames(self, writer: CheckpointWriter | None) -> tuple[list[Frame], Iterator[Frame]]:
-        """Return the last two frames of the resumed run, if any, and the frames that are left."""
+        """Return the last two frames of the resumed run, if any, and the remaining frames."""
         start, end, stride = self.selection
         if self.before is None or writer is None:
             return [], iter(self.source.frames.frames(start, end, stride))
@@ -165,7 +166,7 @@ class TrackingLoop:
 
 @dataclass(frozen=True, eq=False)
 class RunCallbacks:
-    """All callbacks of a run; their time is measured as a stage of its own."""
+    """All callbacks of a run; their time is measured as a separate stage."""
 
     members: tuple[Callback, ...]
     clock: Clock
@@ -176,9 +177,9 @@ class RunCallbacks:
             check_kind("callbacks", member, Callback, "instances of `vggtgeo.Callback`")
 
     def warm_up(self, settings: SlamSettings, roles: Roles, camera: Camera) -> None:
-        """Compile the RGB-D alignment; in a thread, window adjustments and what the callbacks compute from them.
+        """Compile the RGB-D alignment and, in a thread, the adjustment of windows and the programs of callbacks.
 
-        The first frames are tracked meanwhile. A window that is adjusted before its program is ready waits for it.
+        The first frames are tracked meanwhile. A window waits if its program is not ready.
         """
         self.each("on_stage", "compiling")
 
@@ -194,7 +195,7 @@ class RunCallbacks:
             compile_alignment(camera)
 
     def compiled(self) -> None:
-        """Wait for what `warm_up` compiles, and raise its error."""
+        """Wait until `warm_up` has compiled all, and raise its error if there is one."""
         with self.clock.measure("compile"):
             while self.compiling:
                 self.compiling.pop().result()

@@ -194,7 +194,7 @@ def frame_trajectory(slam: Slam, submap: int = 0) -> Trajectory:
 
     """
     check_kind("slam", slam, Slam, "a state of a run, as `vggtgeo.run` yields it")
-    check_whole("submap", submap, most=max(len(submaps_by_size(slam)) - 1, 0) if slam.keyframes else 0)
+    check_whole("submap", submap, maximum=max(len(submaps_by_size(slam)) - 1, 0) if slam.keyframes else 0)
     times, poses = frame_poses(slam)
     own: set[int] = set(submaps_by_size(slam)[submap]) if slam.keyframes else set()
     chosen = np.array([record.tracked and record.reference in own for record in slam.frames], bool)
