@@ -58,7 +58,11 @@ def failing(monkeypatch: pytest.MonkeyPatch):
         (InputError("`x` is 3; it must be 4"), 2, "error: `x` is 3; it must be 4"),
         (PermissionError(13, "Permission denied", "/root/x"), 2, "error: `/root/x`: Permission denied"),
         (KeyboardInterrupt(), 130, "interrupted"),
-        (ZeroDivisionError("by zero"), 1, "internal error: ZeroDivisionError: by zero (where: `vggtgeo --debug ...`)"),
+        (
+            ZeroDivisionError("by zero"),
+            1,
+            "internal error: ZeroDivisionError: by zero (`vggtgeo --debug ...` shows the traceback)",
+        ),
         (typer.Exit(7), 7, ""),
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else None,

@@ -99,7 +99,7 @@ def test_a_clock_that_is_late_is_told(late: float) -> None:
     assert found.time == pytest.approx(late, abs=1.5e-3)
     assert found.ate > 4 * found.ate_left
     assert found.ate_left == pytest.approx(0.005 * np.sqrt(3), rel=0.15)
-    assert "time offset of the truth" in found.message
+    assert "time offset of the ground truth" in found.message
 
 
 def test_noise_of_the_truth_moves_no_clock() -> None:
