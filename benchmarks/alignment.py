@@ -1,11 +1,11 @@
-r"""The RGB-D alignment alone: how far motions between frames are off, and what one takes.
+"""Measure the RGB-D alignment alone: the errors of motions between frames, and the time of one alignment.
 
     .venv/bin/python benchmarks/alignment.py ../shared/data/redkitchen \
         [--truth ../shared/data/redkitchen/reference-colmap.txt] [--frames 120]
 
-Every eighth frame is aligned to each of the eight after it, every time from where the one before came out, as tracking
-does. Against a truth whose scale is its own, motions take that of the whole path. Milliseconds are of one alignment,
-views at hand, compilation left out.
+Every eighth frame is aligned to each of the eight frames after it, each time from the result of the frame before, as in
+tracking. A path given with `--truth` has no known scale, and takes the length of the clip's own ground truth.
+Milliseconds are of one alignment without compilation and without the preparation of the images.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def main() -> None:
     sequence = open_sequence(options.clip)
     own = sequence.ground_truth()
     if own is None:
-        raise SystemExit(f"`{options.clip}` has no truth")
+        raise SystemExit(f"`clip` must have a ground truth, got {options.clip}")
     truth = _with_scale_of(own, Trajectory.load_tum(options.truth)) if options.truth else own
     roles, undistorter = Roles(), sequence.camera.undistorter()
     intrinsics, alignment = np.array(sequence.camera.intrinsics), RgbdAlignment()
@@ -72,7 +72,7 @@ def main() -> None:
 
 
 def _with_scale_of(metric: Trajectory, free: Trajectory) -> Trajectory:
-    """The second trajectory as long as the first."""
+    """Scale the second trajectory to the length of the first."""
     first, second = associate(metric, free)
     poses = free.poses.copy()
     poses[:, :3, 3] *= umeyama(second.positions, first.positions, with_scale=True).scale
@@ -81,8 +81,8 @@ def _with_scale_of(metric: Trajectory, free: Trajectory) -> Trajectory:
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("clip", type=Path, help="a sequence with depth and a truth")
-    parser.add_argument("--truth", type=Path, help="another truth (TUM format); its scale is free")
+    parser.add_argument("clip", type=Path, help="a sequence with depth and ground truth")
+    parser.add_argument("--truth", type=Path, help="another ground truth (TUM format), of unknown scale")
     parser.add_argument("--frames", type=int, default=120)
     return parser.parse_args()
 

@@ -1,17 +1,16 @@
-"""Windows a second for batches of windows, on whatever device JAX has: one in turn, in one program, shared out.
+"""Measure windows per second for batches of windows: one after the other, in one program, or on several devices.
 
     .venv/bin/python benchmarks/batches.py [--sizes small medium] [--batches 1 4 16 64] [--precisions float64 float32]
         [--iterations 10] [--rounds 5] [--cpu-devices 2] [--bench ../shared/bench] [--out runs/batches]
 
-Every window of a batch is the problem of `problems.py` from a start of its own, and takes the same number of
-iterations. Ways: *alone* (one `solve` after the other, called from Python), *in turn* (`solve_batch`, the default on a
-CPU), *in one program* (`vmap`, the default on a GPU), *shared out* (in turn on each of several devices). Rounds
-interleave the ways, and the table has the median. *Alone* and *in turn* are timed on 16 windows where a batch has more:
-what they take for a window does not depend on how many there are, and one by one 4096 take minutes on a GPU. For *in
-one program* the operations and bytes that XLA counts for one iteration of the window are given too, a second (its
-counts are those of the compiled program before any cache: an upper bound of the traffic); `--peak-gflops` and
-`--peak-gbytes` turn them into fractions of a roofline.
-On a GPU: `--batches 1 16 256 4096`.
+Every window of a batch is the problem of `problems.py` from a different start, and takes the same number of iterations.
+Modes: *alone* (one `solve` after the other, called from Python), *in turn* (`solve_batch`, the default on a CPU), *in
+one program* (`vmap`, the default on a GPU), *shared out* (in turn on each of several devices). Rounds interleave the
+modes, and the table has the median. *Alone* and *in turn* are timed on at most 16 windows: the time per window does not
+depend on their number, and 4096 windows would take minutes on a GPU. For *in one program* the table also has the
+operations and bytes per second, as XLA counts them for one iteration of one window (XLA counts before caches, so the
+traffic is an upper bound); `--peak-gflops` and `--peak-gbytes` turn them into fractions of a roofline. On a GPU:
+`--batches 1 16 256 4096`.
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ import numpy as np
 import vggtgeo as vg
 
 LONE = 16
-"""Windows that are solved one by one, of a batch with more."""
+"""Largest number of windows of a batch that are solved one by one."""
 HEADER = (
-    "| size | precision | batch | way | ms a window | windows a second | times one alone "
+    "| size | precision | batch | mode | ms per window | windows per second | times one alone "
     "| Gflop/s | GB/s | of roofline |\n"
     "|---|---|---|---|---|---|---|---|---|---|"
 )
@@ -104,7 +103,7 @@ def _load(size: str, precision: str, options: argparse.Namespace) -> tuple[Any, 
         source = options.bench / "problems.py"
         spec = importlib.util.spec_from_file_location("problems", source)
         if spec is None or spec.loader is None or not source.is_file():
-            raise SystemExit(f"`--bench` {options.bench} holds no problems.py")
+            raise SystemExit(f"`--bench` must be a folder with problems.py, got {options.bench}")
         generator = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(generator)
         np.savez(path, **generator.generate(size))
@@ -113,7 +112,7 @@ def _load(size: str, precision: str, options: argparse.Namespace) -> tuple[Any, 
 
 
 def _batch(problem: Any, state: Any, count: int) -> tuple[Any, Any]:
-    """The problem `count` times, each with inverse depths of its own to start from."""
+    """Return the problem `count` times, and different inverse depths to start each from."""
     noise = np.random.default_rng(0).normal(0, 0.05, (count, *state.inverse_depth.shape))
     starts = state.inverse_depth * jnp.exp(jnp.asarray(noise, state.inverse_depth.dtype))
     repeat = lambda leaf: jnp.broadcast_to(leaf, (count, *jnp.shape(leaf)))
@@ -122,7 +121,7 @@ def _batch(problem: Any, state: Any, count: int) -> tuple[Any, Any]:
 
 
 def _ways(problems: Any, states: Any, solver: Any, count: int) -> dict[str, tuple[Callable[[], Any], int]]:
-    """By name: what solves the windows, and how many it solves."""
+    """Return, by name, functions that solve the windows, and how many windows each solves."""
     few = min(count, LONE)
     first = jax.tree.map(lambda leaf: leaf[:few], (problems, states))
     one = jax.jit(lambda problem, state: vg.solve(problem, state, solver=solver).energy)
@@ -142,7 +141,7 @@ def _ways(problems: Any, states: Any, solver: Any, count: int) -> dict[str, tupl
 
 
 def _cost(problems: Any, states: Any, solver: Any, count: int) -> dict[str, float]:
-    """Operations and bytes of one iteration of one window, as XLA counts the program of a single iteration."""
+    """Return operations and bytes of one iteration of one window, as XLA counts those of the compiled program."""
     single = eqx.tree_at(lambda s: s.max_iterations, solver, 1)
     run = jax.jit(lambda p, s: vg.batches.solve_batch(p, s, solver=single, at_once=count).energy)
     found = run.lower(problems, states).compile().cost_analysis() or {}
@@ -150,7 +149,7 @@ def _cost(problems: Any, states: Any, solver: Any, count: int) -> dict[str, floa
 
 
 def _rates(cost: dict[str, float], seconds: float, options: argparse.Namespace) -> dict[str, float]:
-    """Rates of a whole window, its iterations counted, and the fraction of the roofline where the peaks are given."""
+    """Return operations and bytes per second, and their fractions of the roofline where the peaks are given."""
     rate = options.iterations / seconds / 1e9
     rates = {"gflops": cost["flops"] * rate, "gbytes": cost["bytes"] * rate}
     if options.peak_gflops and options.peak_gbytes:
@@ -168,7 +167,7 @@ def _markdown(row: dict[str, Any]) -> str:
 
 
 def _draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Windows a second against the size of the batch."""
+    """Draw windows per second against the size of the batch."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -180,7 +179,7 @@ def _draw(rows: list[dict[str, Any]], path: Path) -> None:
         for way in dict.fromkeys(row["way"] for row in rows):
             here = [r for r in rows if (r["size"], r["precision"], r["way"]) == (size, precision, way)]
             axes.plot([r["batch"] for r in here], [1e3 / r["ms"] for r in here], "o-", label=way)
-        axes.set(xscale="log", xlabel="windows in the batch", ylabel="windows a second", title=f"{size}, {precision}")
+        axes.set(xscale="log", xlabel="windows in the batch", ylabel="windows per second", title=f"{size}, {precision}")
         axes.set_ylim(bottom=0)
         axes.grid(alpha=0.3)
     panels[0][0].legend(fontsize=8)

@@ -1,12 +1,12 @@
-"""Frames between keyframes of maps without depth: carried along with their keyframe, or placed by the finished map.
+"""Compare two ways to place the frames between keyframes, in maps without depth: moved with their keyframe, or placed
+again by the finished map.
 
     D=../shared/data
     .venv/bin/python benchmarks/between_keyframes.py $D/building-walk $D/corridor-office $D/redkitchen $D/icl-office
 
-One run of each clip without its depth, whose frames are then taken either way
-(`vggtgeo/slam/global_map/frame_poses.py`):
-ATE after Sim(3) of all frames, and what a step from frame to frame is off, root mean square and largest, all in cm. The
-steps of the truth count in full: a truth that is jagged itself shows here.
+Each clip is run once without its depth, and the other frames are then placed in both ways
+(`vggtgeo/slam/global_map/frame_poses.py`). The table has the ATE after Sim(3) of all frames, and the RMS and largest
+error of the steps from frame to frame, in cm. Noise of the ground truth counts in the errors of the steps.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ def main() -> None:
     """Run every clip and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", nargs="+", type=Path)
-    parser.add_argument("--frames", type=int, help="of each clip, by default all")
+    parser.add_argument("--frames", type=int, help="frames of each clip, by default all")
     options = parser.parse_args()
-    print("| clip | frames | carried: ATE | step, rms | largest | placed: ATE | step, rms | largest |")
+    print("| clip | frames | with keyframe: ATE | step, rms | largest | placed again: ATE | step, rms | largest |")
     print("|---|---|---|---|---|---|---|---|")
     for path in options.clips:
         sequence = open_sequence(path)
@@ -47,7 +47,7 @@ def main() -> None:
 
 
 def errors(slam: Slam, sequence: Sequence, poses: Poses) -> tuple[float, float, float]:
-    """ATE, and what steps are off, cm."""
+    """Return the ATE and the RMS and largest error of steps between frames, cm."""
     times, found = poses(slam)
     tracked = [record.tracked for record in slam.frames]
     truth = sequence.ground_truth()
@@ -60,7 +60,7 @@ def errors(slam: Slam, sequence: Sequence, poses: Poses) -> tuple[float, float, 
 
 
 def rms(values: np.ndarray) -> float:
-    """Root mean square."""
+    """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 

@@ -27,16 +27,16 @@ from vggtgeo.io.errors import InputError
 from vggtgeo.simulation.degradations import Recording, camera_velocities, with_images
 
 NATIVE_WIDTH = 640
-"""Pixels of the sensor's own images, in which disparities and windows are given."""
+"""Width of the sensor's images, pixels; disparities and windows are in these pixels."""
 INSTANTS = 5
-"""Moments of an exposure whose mean is the image."""
+"""Number of times within an exposure; the image is their mean."""
 ROUNDS = 2
-"""Iterations for the position from which a pixel moved."""
+"""Iterations of `_source`."""
 
 
 def in_bands_of_light(image: np.ndarray, row: int, share: float, period: float, speed: float) -> np.ndarray:
-    """Return the image, uint8 [H, W, 3], with flicker of a rolling shutter: bands of `period` rows with `share` more
-    and less light, which move by `speed` rows per image. row: of this image.
+    """Return the image, uint8 [H, W, 3], with the flicker of a rolling shutter: bands of `period` rows with `share`
+    more and less light, which move by `speed` rows per image. row: number of this image.
     """
     phase = 2 * np.pi * (np.arange(len(image))[:, None, None] + speed * row) / period
     return np.clip(image * (1 + share * np.sin(phase)), 0, 255).astype(np.uint8)
@@ -54,9 +54,9 @@ def motion_field(
     """Return how pixels and their depth change with time.
 
     depth: float [H, W], metres; pixels without depth take the median. velocity: float64 [6], of world -> camera,
-    translation first, metres and radians a second (`camera_velocities`). intrinsics: fx, fy, cx, cy, pixels.
-    Returns the motion of the pixels, float32 [H, W, 2], pixels a second, and that of their depth, float32 [H, W],
-    metres a second.
+    translation first, metres and radians per second (`camera_velocities`). intrinsics: fx, fy, cx, cy, pixels.
+    Returns the motion of the pixels, float32 [H, W, 2], pixels per second, and that of their depth, float32 [H, W],
+    metres per second.
     """
     fx, fy = intrinsics[:2]
     known = np.isfinite(depth) & (depth > 0)
@@ -73,7 +73,7 @@ def exposed(recording: Recording, readout: float = 0.0, exposure: float = 0.0) -
     """Apply rolling shutter and exposure time.
 
     readout: seconds from the first row to the last; timestamps name the middle one. exposure: seconds the shutter is
-    open. Depth stays that of the frame's instant: depth cameras have a shutter of their own.
+    open. Depth is unchanged, because depth cameras have a separate shutter.
     Raises InputError if frames have no depth, which determines the motion of pixels.
     """
     instants = exposure * ((np.arange(INSTANTS) + 0.5) / INSTANTS - 0.5) if exposure else np.zeros(1)
@@ -90,7 +90,7 @@ def exposed(recording: Recording, readout: float = 0.0, exposure: float = 0.0) -
 
 
 def late_depth(recording: Recording, seconds: float) -> Recording:
-    """Replace depth by that of so many seconds before its image; negative: after.
+    """Replace depth by the depth `seconds` before its image; negative: after it.
 
     Raises InputError if frames have no depth.
     """
@@ -106,7 +106,7 @@ def late_depth(recording: Recording, seconds: float) -> Recording:
 
 
 def late_truth(recording: Recording, seconds: float) -> Recording:
-    """Shift the clock of the ground truth ahead by so many seconds."""
+    """Shift the clock of the ground truth ahead by `seconds`."""
     truth = recording.truth
     return replace(recording, truth=Trajectory(truth.timestamps + seconds, truth.poses))
 
@@ -143,7 +143,9 @@ def _as_bytes(image: np.ndarray) -> np.ndarray:
 
 def _depth(frame: Frame) -> np.ndarray:
     if frame.depth is None:
-        raise InputError(f"frame {frame.index} has no depth, which determines the motion of its pixels: give depth")
+        raise InputError(
+            f"`frames` must have depth, which determines the motion of pixels, got none in frame {frame.index}"
+        )
     return frame.depth
 
 
@@ -154,8 +156,8 @@ def _each(recording: Recording, change: Callable[[Frame, np.ndarray], Frame]) ->
 
 
 def _source(field: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the position in the frame of what each pixel shows so many seconds later, float [H, 1]: p + seconds
-    field(p) = pixel.
+    """Return the positions p of which each pixel shows the content `seconds` (float [H, 1]) later: p + seconds field(p)
+    = pixel.
     """
     rows, columns = np.mgrid[: field.shape[0], : field.shape[1]].astype(np.float32)
     late, at = seconds.astype(np.float32), field
@@ -167,7 +169,7 @@ def _source(field: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 @dataclass(frozen=True)
 class DisparitySensor:
-    """The error model of a depth camera that triangulates.
+    """Simulate a depth camera that triangulates.
 
     focal_baseline: focal length times baseline, pixels x metres. noise: standard deviation of the disparity, pixels.
     grain: pixels over which this noise is correlated. step: quantisation of the disparity, pixels. window: side of the
@@ -208,7 +210,7 @@ STEREO = DisparitySensor(focal_baseline=30.0, noise=0.08, grain=7.0, step=0.0312
 
 
 def _hidden(disparity: np.ndarray) -> np.ndarray:
-    """Return pixels that the second view does not see: one to their right is nearer, and covers their place in it."""
+    """Return pixels that the second view does not see, because a nearer surface to their right covers them."""
     place = np.arange(disparity.shape[1]) - disparity
     beyond = np.minimum.accumulate(place[:, ::-1], axis=1)[:, ::-1]
     hidden = np.zeros(disparity.shape, bool)

@@ -1,14 +1,16 @@
-"""What a lens costs in the adjustment, and what many cameras cost: simulated keyframes, solved with each.
+"""Measure what lens models, and many cameras, cost in bundle adjustment of simulated keyframes.
 
     python benchmarks/cameras.py [--keyframes 8] [--points 400]
     python benchmarks/cameras.py --groups 0 16 49 [--keyframes 49] [--points 147] [--reach 8] [--rounds 5]
 
-Without `--groups`, a row a model of the lens: seconds of the first call, compilation counted in, seconds of the second,
-iterations, the last energy. The window has no distortion, so a fisheye, which always bends, explains it a little worse.
+Without `--groups`, the table has a row for each lens model: seconds of the first call with compilation, seconds of the
+second, iterations, and the last energy. The window has no distortion, and a fisheye lens always has some, so its energy
+is a little larger.
 
-With `--groups`, a row a number of cameras (0: one that all keyframes share), each with f, k1, k2 free, on a loop whose
-keyframes see `reach` others before and after them: milliseconds of an iteration, and their ratio to the first row. The
-rows run in turns, so that what else the machine does hits all of them; times are the least over the rounds.
+With `--groups`, the table has a row for each number of cameras (0: one that all keyframes share), each with f, k1, k2
+free, on a loop whose keyframes see `reach` others before and after them: milliseconds of an iteration, and their ratio
+to the first row. The rows are measured by turns, so that other load on the machine affects all of them; times are the
+least over the rounds.
 """
 
 from __future__ import annotations
@@ -25,11 +27,11 @@ import vggtgeo as vg
 
 MODELS = (vg.cameras.Pinhole, vg.cameras.RadialTangential, vg.cameras.KannalaBrandt)
 SIGMA = 0.05
-"""Of each coefficient of a lens."""
+"""Prior standard deviation of each coefficient of a lens."""
 FREE = np.isin(("f", *vg.cameras.RadialTangential.names[2:]), ("f", "k1", "k2"))
-"""Of the parameters of each of many cameras."""
+"""Free parameters of each of many cameras."""
 ITERATIONS = 10
-"""Of a timed solve."""
+"""Iterations of a timed solve."""
 
 
 def main() -> None:
@@ -57,14 +59,16 @@ def many_cameras(groups: list[int], keyframes: int, points: int, reach: int, rou
     solves = {count: timed_solve(window, count) for count in groups}
     times = [[solve() for solve in solves.values()] for _ in range(rounds)]
     least = np.min(times, axis=0)
-    print("| cameras | parameters | ms an iteration | of the first row |\n" + "|---" * 4 + "|")
+    print("| cameras | parameters | ms per iteration | ratio to the first row |\n" + "|---" * 4 + "|")
     for count, seconds in zip(groups, least, strict=True):
         name = f"{count}" if count else "1, shared"
         print(f"| {name} | {max(count, 1) * int(FREE.sum())} | {1e3 * seconds:.0f} | {seconds / least[0]:.2f} |")
 
 
 def timed_solve(window: vg.data.SimulatedWindow, count: int) -> Callable[[], float]:
-    """Seconds an iteration of a compiled solve with so many cameras, which took the keyframes in turns."""
+    """Return a function that gives the seconds per iteration of a compiled solve, with `count` cameras used by turns
+    (0: one shared camera).
+    """
     focal, _, x, y = window.intrinsics
     guess = np.tile([1.01 * focal, x, y, 0.0, 0.0, 0.0, 0.0], (max(count, 1), 1))
     options = {"fixed": ~FREE, "prior_sigma": np.array([10.0, 5.0, 5.0, SIGMA, SIGMA, SIGMA, SIGMA])}

@@ -1,11 +1,11 @@
-"""Measure what the README's window and a chain of five windows compile, in processor seconds.
+"""Measure how long the README's window and a chain of five windows take to compile, in processor seconds.
 
     .venv/bin/python benchmarks/compile_time.py [--cache FOLDER]
 
-Of the window: value, gradient by the matches' weights, and Hessian product. The chain is the gradient of the last pose
-by the first window's weights through five windows that are solved, marginalised and slid in a `scan`. Each runs in a
-process of its own. Without `--cache` everything is compiled; with it a second call shows what a cache saves. Processor
-seconds count all threads: on two idle cores the wall time is about two thirds of them.
+Of the window, the value, the gradient by the matches' weights, and the Hessian product are compiled. The chain is the
+gradient of the last pose by the first window's weights, through five windows that are solved, marginalised and slid in
+a `scan`. Each runs in a separate process. Without `--cache` everything is compiled; with it a second call shows what a
+cache saves. Processor seconds count all threads: on two idle cores the wall time is about two thirds of them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cache", help="folder of JAX's compilation cache")
-    parser.add_argument("--one", choices=NAMES, help="this one, in this process")
+    parser.add_argument("--one", choices=NAMES, help="measure only this, in this process")
     options = parser.parse_args()
     if options.one:
         print(measured(options.one, options.cache))
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def measured(name: str, cache: str | None) -> str:
-    """A row of the table."""
+    """Return a row of the table."""
     jax.config.update("jax_enable_x64", True)
     jax.config.update("jax_enable_compilation_cache", cache is not None)
     if cache is not None:
@@ -59,7 +59,7 @@ def measured(name: str, cache: str | None) -> str:
 
 
 def _window(name: str) -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
-    """A function of the matches' weights of the README's window, and the weights."""
+    """Return a function of the matches' weights of the README's window, and the weights."""
     window = vg.simulate_window()
     seen = window.observations
     problem, initial, _ = vg.pack(
@@ -80,7 +80,9 @@ def _window(name: str) -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
 
 
 def _chain() -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
-    """The gradient through windows as large as the README's, the oldest keyframe marginalised after each."""
+    """Return the gradient through windows as large as the README's, where the oldest keyframe is marginalised after
+    each.
+    """
     long = vg.simulate_window(KEYFRAMES + WINDOWS - 1)
     parts, camera = [], vg.cameras.Intrinsics(long.intrinsics, fixed=True)
     for first in range(WINDOWS):
@@ -89,7 +91,7 @@ def _chain() -> tuple[Callable[[jax.Array], jax.Array], jax.Array]:
         parts.append((seen, long.start[list(inside)], camera, seen.depth_mean))
     windows = vg.batches.pack_batch(parts, terms=[vg.empty_prior(KEYFRAMES)])[:2]
     first, start = jax.tree.map(lambda leaf: leaf[0], windows)
-    # The last window is slid into the first one again, so that the body is compiled once; nothing looks at that.
+    # The last window is slid into the first one again, so that the body is compiled once; its result is not used.
     following = jax.tree.map(lambda leaf: jnp.roll(leaf, -1, 0), windows)
 
     def loss(weight: jax.Array) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Clips to which something was done, for benchmarks of what the pipeline makes of that."""
+"""Degrade clips, run them and print a table: shared by several benchmarks."""
 
 from __future__ import annotations
 
@@ -14,21 +14,20 @@ from vggtgeo.benchmark.inputs import RenderedWalk
 from vggtgeo.datasets.views import SequenceView
 from vggtgeo.io.errors import InputWarning
 from vggtgeo.simulation.degradations import Degradation, Recording
-from vggtgeo.slam.verdict.corner_recorder import CornerTracks
 
 
 def degraded_clips(
     folder: Path, count: int, changes: Mapping[str, Degradation], depth_alone: bool = False
 ) -> Iterator[tuple[str, SequenceView]]:
-    """The first frames of a clip with each of these things done to them, with depth where there is some and, but for
-    `depth_alone`, without.
+    """Yield the first frames of a clip with each change applied: with depth where the clip has it, and without depth
+    except for the changes of `depth_alone`.
     """
     clip = vg.read(folder)
     truth = clip.ground_truth()
     if truth is None:
-        raise SystemExit(f"`{folder}` has no truth to compare with")
+        raise SystemExit(f"`clips` must have a ground truth, got {folder}")
     if depth_alone and not clip.has_depth:
-        raise SystemExit(f"`{folder}` has no depth to change")
+        raise SystemExit(f"`clips` must have depth to change, got {folder}")
     frames = list(clip.frames(0, min(count, len(clip))))
     for name, change in changes.items():
         changed = change(Recording(frames, clip.camera, truth), np.random.default_rng(0))
@@ -39,23 +38,15 @@ def degraded_clips(
 
 
 def judged(sequence: SequenceView, settings: vg.SlamSettings | None = None) -> tuple[vg.Result, float]:
-    """The result, and its ATE: metres, after SE(3) with depth, after Sim(3) without; NaN where nothing was tracked."""
+    """Return the result and its ATE: metres, after SE(3) with depth, after Sim(3) without; NaN where nothing was
+    tracked.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         result = vg.reconstruct(sequence, settings=settings, options=vg.RunOptions(dense="none"))
     truth = result.summary.get("truth")
     alignment = "ate_se3_m" if sequence.has_depth else "ate_sim3_m"
     return result, truth[alignment]["rmse"] if truth else float("nan")
-
-
-def evidence(sequence: SequenceView) -> CornerTracks:
-    """What the verdict looks at, of each frame."""
-    recorder = vg.callbacks.CornerRecorder(sequence.camera)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        for frame in sequence.frames():
-            recorder.add(frame)
-    return recorder.frames
 
 
 def print_table(
@@ -65,14 +56,16 @@ def print_table(
     cells: Callable[[SequenceView], Iterable[str]],
     depth_alone: bool = False,
 ) -> None:
-    """A row for each clip of the command line, with depth and, but for `depth_alone`, without, and each thing done.
+    """Print a row for each clip of the command line, change, and input (with and without depth).
 
-    text: docstring of the benchmark. columns: heads of what `cells` gives of a sequence.
+    text: docstring of the benchmark. columns: headings of the cells that `cells` returns for a sequence.
     """
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", type=Path, nargs="+")
     parser.add_argument("--frames", type=int, default=40)
-    parser.add_argument("--changes", nargs="*", choices=changes, default=list(changes), help="by default all")
+    parser.add_argument(
+        "--changes", nargs="*", choices=changes, default=list(changes), help="which changes to apply, by default all"
+    )
     options = parser.parse_args()
     changes = {name: changes[name] for name in options.changes}
     print(f"| {' | '.join(('clip', 'input', 'change', *columns))} |\n" + "|---" * (3 + len(columns)) + "|")

@@ -1,11 +1,11 @@
-"""How much memory the dense map of a long run takes, and how long it takes to make.
+"""Measure the memory and the time that the dense map of a long run takes.
 
     .venv/bin/python benchmarks/dense_memory.py ../shared/data/redkitchen --keyframes 64 192 384
     .venv/bin/python benchmarks/dense_memory.py ../shared/data/building-walk --rgb-only --keyframes 160 480
 
-A clip is run once; its keyframes are set beside themselves, 30 m apart, until there are so many, as a building that is
-walked through would have them. Each row is a process of its own (Linux). Memory: of the process with its keyframes
-alone, and at most while depth, cloud and mesh are made.
+A clip is run once; its keyframes are copied, each copy 30 m away from the last, until there are as many as asked for,
+as in a walk through a large building. Each row is measured in a separate process (Linux). Memory: of the process with
+its keyframes alone, and the peak while depth, cloud and mesh are made.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
 from vggtgeo.slam.sparse_map.keyframe import Keyframe
 
 APART = 30.0
-"""Metres, or units of a map without depth: beyond what is seen."""
+"""Distance between copies, metres or units of a map without depth: more than keyframes see."""
 
 
 def main() -> None:
@@ -86,7 +86,7 @@ def _beside(keyframe: Keyframe, number: int, turn: int) -> Keyframe:
 
 
 def _megabytes() -> float:
-    """The most that this process has had so far; Linux counts that of its parent in `ru_maxrss`."""
+    """Return the peak memory of this process; `ru_maxrss` would include that of its parent on Linux."""
     found = re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(encoding="ascii"))
     assert found is not None
     return int(found.group(1)) / 1024

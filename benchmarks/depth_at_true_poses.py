@@ -1,11 +1,11 @@
-"""Does the measured depth of a clip agree with its true poses? Matches are triangulated between true poses.
+"""Compare the measured depth of a clip with matches that are triangulated between its true poses.
 
     .venv/bin/python benchmarks/depth_at_true_poses.py ../shared/data/icl-office-kt0 ../shared/data/icl-office
 
-SIFT of every fifth frame is matched with the next seven of these, where the camera moved by 3 cm and more. Prints for
-each range of depth the number of matches, their share of the information on the scale of the path, and the median of
-the triangulated over the measured depth, weighted by that information. 1 is right; above it the depth is too short, and
-the path of a run with this depth is too small, too.
+SIFT features of every fifth frame are matched with the next seven of these, where the camera moved by 3 cm or more.
+Prints for each range of depth the number of matches, their share of the information on the scale of the path, and the
+median of the triangulated over the measured depth, weighted by that information. 1 is right; above it the measured
+depth is too short, and the path of a run with this depth is too small, too.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, nearest_in_time
 from vggtgeo.geometry import pinhole, rigid
 
 RANGES = np.array([0.3, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 8.0])
-"""Metres."""
+"""Limits of the ranges of depth, metres."""
 EVERY, NEXT, MIN_BASELINE = 5, 7, 0.03
 MAX_ERROR = 8.0
 """Pixels between a match and the projection with the measured depth; more is a wrong match, or an edge of the depth."""

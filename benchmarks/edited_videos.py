@@ -1,16 +1,16 @@
-"""What phones, editors and screens do to a video: what it costs, and whether it is told.
+"""Measure what phones, editors and screens do to a video, and whether the run reports it.
 
     D=../shared/data
     .venv/bin/python benchmarks/edited_videos.py $D/building-walk $D/corridor-office $D/redkitchen $D/icl-office
 
-The first 40 frames of each clip, with depth and without: the picture wanders on the sensor, as behind a lens that is
-stabilised (8 and 20 px); an editor's stabiliser, which moves, turns and scales each picture so that the path of the
-followed corners is smooth (by at most 8 % of the width, 3.4 degrees and 5 %; depth stays where it was); a mirrored
-picture over depth that is not (without depth it is a video of the mirrored room); a focus that breathes (2 and 5 % of
-the focal length); writing all over it that shines through; fifteen frames of a title before it; a beginning that comes
-out of the dark; sides filled with an enlarged, blurred copy; a second picture in its corner; a screen that was filmed
-(moire, bands of light); a recorder that hangs for twelve frames and repeats its picture (depth goes on);
-a camera that stands still for as long. ATE after SE(3) with depth, after Sim(3) without.
+The first 40 frames of each clip, with depth and without, are changed in these ways: the image shifts on the sensor, as
+behind a stabilised lens (8 and 20 px); an editor's stabiliser moves, turns and scales each image so that the path of
+the tracked corners is smooth (by at most 8 % of the width, 3.4 degrees and 5 %; depth is unchanged); a mirrored image
+with depth that is not mirrored (without depth this is a valid video of the mirrored room); a focal length that varies
+with focus (2 and 5 %); transparent text; fifteen frames of a title at the start; a fade in; sides filled with an
+enlarged, blurred copy; a second picture in a corner; a filmed screen (moire, bands of light); a recorder that repeats
+one image for twelve frames (depth continues); a camera that stands still for as long. ATE after SE(3) with depth, after
+Sim(3) without.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ TITLE = 15
 
 
 def wandering(pixels: float) -> Degradation:
-    """The picture walks at random, at most so far from where it belongs."""
+    """Shift the image on the sensor at random, by at most `pixels`."""
 
     def change(recording: Recording, rng: np.random.Generator) -> Recording:
         walk = np.cumsum(rng.normal(size=(len(recording.frames), 2)), axis=0)
@@ -45,8 +45,8 @@ def wandering(pixels: float) -> Degradation:
 
 
 def stabilised(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Each picture is moved, turned and scaled from the path of the followed corners to that path, smoothed over a
-    second of 30 frames; what is missing at the border repeats it.
+    """Move, turn and scale each image from the path of the tracked corners to that path smoothed over a second of 30
+    frames; the border is repeated where pixels are missing.
     """
     del rng
     images = [frame.image for frame in recording.frames]
@@ -61,21 +61,21 @@ def stabilised(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def mirrored(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Left is right, as a front camera shows it; depth stays."""
+    """Mirror the images left to right, as a front camera shows them; depth is unchanged."""
     del rng
     return with_images(recording, lambda image, row: np.ascontiguousarray(image[:, ::-1]))
 
 
 def hangs(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Twelve pictures in the middle are the one before them."""
+    """Repeat one image for twelve frames in the middle."""
     del rng
     last = len(recording.frames) // 2
-    held = recording.frames[last - HANGS].image
-    return with_images(recording, lambda image, row: held if last - HANGS < row <= last else image)
+    repeated = recording.frames[last - HANGS].image
+    return with_images(recording, lambda image, row: repeated if last - HANGS < row <= last else image)
 
 
 def stands(recording: Recording, rng: np.random.Generator) -> Recording:
-    """The camera stands still for so long: the same frame again and again, its depth and the truth, too."""
+    """Stop the camera for twelve frames: repeat one frame with its depth and its true pose, and show the rest later."""
     del rng
     middle = len(recording.frames) // 2
     rows = [row if row <= middle - HANGS else max(middle - HANGS, row - HANGS) for row in range(len(recording.frames))]
@@ -95,7 +95,9 @@ SMOOTH = 12
 
 
 def _path(images: list[np.ndarray]) -> np.ndarray:
-    """x and y in pixels, turn in radians, logarithm of the scale, [n, 4], summed up from picture to picture."""
+    """Return the sum of the motions between images: x and y in pixels, turn in radians, logarithm of the scale, [n,
+    4].
+    """
     grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
     whole, found = np.eye(3), [np.zeros(4)]
     for before, after in itertools.pairwise(grey):
@@ -110,7 +112,7 @@ def _path(images: list[np.ndarray]) -> np.ndarray:
 
 
 def _turned(image: np.ndarray, factor: float, angle: float, shift: tuple[float, float]) -> np.ndarray:
-    """About the middle."""
+    """Rotate and scale the image about its centre, then shift it."""
     height, width = image.shape[:2]
     cos, sin = factor * np.cos(angle), factor * np.sin(angle)
     matrix, middle = np.array([[cos, -sin], [sin, cos]]), np.array([width - 1, height - 1]) / 2
@@ -119,7 +121,7 @@ def _turned(image: np.ndarray, factor: float, angle: float, shift: tuple[float, 
 
 
 def breathing(share: float) -> Degradation:
-    """The picture grows and shrinks by so much within 23 frames."""
+    """Enlarge and shrink the image by `share` within 23 frames."""
     grown = lambda row: 1 + share * np.sin(2 * np.pi * row / 23)
     return lambda recording, rng: with_images(recording, lambda image, row: _moved(image, grown(row), (0.0, 0.0)))
 
@@ -132,7 +134,7 @@ def _moved(image: np.ndarray, factor: float, shift: tuple[float, float] | np.nda
 
 
 def watermark(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Five lines of writing that are added to what is behind them."""
+    """Add five lines of transparent text."""
     del rng
     height, width = recording.frames[0].image.shape[:2]
     lines = ("stock-video.example",) * 5
@@ -141,7 +143,7 @@ def watermark(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def title(recording: Recording, rng: np.random.Generator) -> Recording:
-    """A card with writing, before the first frame; nobody is asked where the camera was then."""
+    """Put a card with text before the first frame; its frames have no true pose."""
     del rng
     first, second = recording.frames[:2]
     step, empty = second.timestamp - first.timestamp, None
@@ -158,14 +160,16 @@ def title(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def out_of_the_dark(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Black for three frames, and bright after fifteen."""
+    """Fade in: black for three frames, full brightness after fifteen."""
     del rng
     light = lambda row: np.clip((row - 3) / 12, 0.0, 1.0)
     return with_images(recording, lambda image, row: (image * light(row)).astype(np.uint8))
 
 
 def blurred_sides(recording: Recording, rng: np.random.Generator) -> Recording:
-    """An upright video in a wide one: the middle third, an enlarged, blurred copy beside it; depth in the middle."""
+    """Make an upright video in a wide one: the middle third, with an enlarged, blurred copy beside it; depth in the
+    middle only.
+    """
     del rng
     height, width = recording.frames[0].image.shape[:2]
     middle = slice(width // 3, 2 * width // 3)
@@ -182,7 +186,7 @@ def blurred_sides(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def second_picture(recording: Recording, rng: np.random.Generator) -> Recording:
-    """The same film, mirrored and three times as fast, in a ninth of the picture."""
+    """Show the same video, mirrored and three times as fast, in a ninth of the image."""
     del rng
     images = [frame.image for frame in recording.frames]
     height, width = images[0].shape[:2]
@@ -197,7 +201,7 @@ def second_picture(recording: Recording, rng: np.random.Generator) -> Recording:
 
 
 def filmed_screen(recording: Recording, rng: np.random.Generator) -> Recording:
-    """Fine stripes of 12 % that wander fast, and bands of light of 10 %."""
+    """Add fine stripes of 12 % that move fast, and bands of light of 10 %."""
     del rng
 
     def paint(image: np.ndarray, row: int) -> np.ndarray:
@@ -217,7 +221,7 @@ def _written(image: np.ndarray, lines: tuple[str, ...], colour: tuple[int, int, 
 
 
 CHANGES: dict[str, Degradation] = {
-    "as it is": as_it_is,
+    "unchanged": as_it_is,
     "wanders by 8 px": wandering(8.0),
     "wanders by 20 px": wandering(20.0),
     "stabilised": stabilised,
@@ -232,7 +236,7 @@ CHANGES: dict[str, Degradation] = {
 
 
 def cells(sequence: SequenceView) -> Iterator[str]:
-    """What came of it."""
+    """Return the cells of the result."""
     result, error = judged(sequence)
     tracked = f"{result.summary['frames_tracked']}/{result.summary['frames']}"
     yield from (f"{100 * error:.1f}", tracked, result.verdict.level, "; ".join(result.verdict.reasons))

@@ -1,11 +1,11 @@
-"""Do the corners that a verdict follows from image to image agree with the truth, whatever the light does?
+"""Compare the corners that the verdict tracks from image to image with the ground truth, under several lights.
 
     .venv/bin/python benchmarks/followed_corners.py ../shared/data/* [--frames 120]
 
-A row for each clip and light: how many corners two neighbouring frames share (median, least), the share of them that
-the true poses and depths explain to `AGREE` pixels (median, lowest twentieth), and steps with too few to link two
-frames. Bands:
-grey levels, root mean square, by which two images differ in what is common to a row (median, highest twentieth).
+The table has a row for each clip and light: the number of corners that two neighbouring frames share (median, least),
+the share of them that agrees with the true poses and depths within `AGREE` pixels (median, lowest twentieth), and the
+steps with too few corners to link two frames. Bands: RMS difference between two images of what all pixels of a row
+share, in grey levels (median, highest twentieth).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ AGREE = 3.0
 
 
 def main() -> None:
-    """Follow, compare, print."""
+    """Track and compare the corners, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", type=Path, nargs="+")
     parser.add_argument("--frames", type=int, default=120)
@@ -43,7 +43,7 @@ def main() -> None:
         clip = vg.read(folder)
         truth = clip.ground_truth()
         if truth is None or not clip.has_depth:
-            raise SystemExit(f"`{folder}` has no truth, or no depth")
+            raise SystemExit(f"`clips` must have depth and a ground truth, got {folder}")
         recording = Recording(list(clip.frames(0, options.frames)), clip.camera, truth)
         for name, light in LIGHTS.items():
             found, bands = _steps(with_images(recording, light))
@@ -58,7 +58,7 @@ def main() -> None:
 
 
 def _steps(recording: Recording) -> tuple[list[np.ndarray], list[float]]:
-    """How far corners are from where the truth carries them, step by step, and the bands of light."""
+    """Return the distance of corners from their true places, step by step, and the bands of light."""
     recorder, images = vg.callbacks.CornerRecorder(recording.camera), []
     for frame in recording.frames:
         recorder.add(frame)
@@ -89,7 +89,7 @@ def _whole(image: np.ndarray) -> np.ndarray:
 
 
 LIGHTS = {
-    "as it is": lambda image, number: image,
+    "unchanged": lambda image, number: image,
     "bands of 300 rows, 30 %": partial(in_bands_of_light, share=0.3, period=300, speed=90),
     "bands of 100 rows, 30 %": partial(in_bands_of_light, share=0.3, period=100, speed=40),
     "bands of 60 rows, 15 %": partial(in_bands_of_light, share=0.15, period=60, speed=25),

@@ -1,14 +1,14 @@
-"""What a backward pass costs: gradient of a loss through `solve` by every float leaf, in iterations of the solve.
+"""Measure what a backward pass costs: the gradient of a loss through `solve` by every float leaf, in iterations of the
+solve.
 
     .venv/bin/python benchmarks/gradients.py [--sizes small medium] [--rounds 5] [--iterations 10 40]
         [--bench ../shared/bench] [--out runs/gradients]
 
 For each size and number of iterations: the time of `solve` alone, the time of `jax.value_and_grad` of a loss of its
-state, and the difference in units of one iteration of the solve (medians over interleaved rounds); the polish that the
-derivative needs is part of it. Memory is what XLA sets aside for the compiled program beyond its arguments and results:
-it must not grow with the iterations. The size `global` is 200 keyframes, solved and differentiated
-by a band.
-Writes `gradients.md` and `gradients.json`. It runs on whatever device JAX has.
+state, and the difference in units of one iteration of the solve (medians over interleaved rounds); this includes the
+polish that the derivative needs. Memory is what XLA reserves for the compiled program beyond its arguments and results:
+it must not grow with the iterations. The size `global` is 200 keyframes, solved and differentiated by a band matrix.
+Writes `gradients.md` and `gradients.json`, on any device that JAX has.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import numpy as np
 import vggtgeo as vg
 
 HEADER = (
-    "| size | iterations | ms an iteration | forward and backward, ms | backward, iterations | memory of solve MB "
+    "| size | iterations | ms per iteration | forward and backward, ms | backward, iterations | memory of solve MB "
     "| of both MB | compile s, solve | both |\n|---|---|---|---|---|---|---|---|---|"
 )
 

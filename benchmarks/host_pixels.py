@@ -1,17 +1,17 @@
-"""The noise of a landmark's pixel in its host: an unknown of bundle adjustment, or taken as exact.
+"""Compare adjustments in which a landmark's pixel in its host keyframe is an unknown, or is taken as exact.
 
     python benchmarks/host_pixels.py --seeds 150
 
-Simulated windows (`vggtgeo.simulate_window`) with 0.5 px of noise in every image, that of the host included, right
-weights and a depth prior of 3 %. Three adjustments of the same numbers: the host's pixel exact, the host's pixel an
-unknown of its own (`Observations.pixel_sigma`), and, as the oracle, points in space by dense Gauss-Newton steps written
-here, which shares no code with the package. A row each: the error of the camera centres (RMSE of all cameras but the
-first, which is held) and their NEES, squared error over stated covariance, per degree of freedom (honest: 1).
+Simulated windows (`vggtgeo.simulate_window`) have 0.5 px of noise in every image, the host's included, correct weights
+and a depth prior of 3 %. Three adjustments of the same data: the host's pixel exact; the host's pixel an unknown
+(`Observations.pixel_sigma`); and, as the oracle, points in space by dense Gauss-Newton steps in this file, which use no
+code of the package. The table has a row for each: the error of the camera centres (RMSE of all cameras but the first,
+which is fixed) and their NEES, squared error over stated covariance, per degree of freedom (expected: 1).
 
     python benchmarks/host_pixels.py --time PROBLEM.npz
 
-is the cost: processor time an iteration of a saved window (`../shared/bench/problems.py medium` makes one), with and
-without the unknown, in turns in one process; on one core, `taskset -c 0` before it.
+measures the cost: processor time per iteration of a saved window (`../shared/bench/problems.py medium` makes one), with
+and without the unknown, by turns in one process. For one core, put `taskset -c 0` before it.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def _window(seed: int, options: argparse.Namespace) -> SimulatedWindow:
-    """A window whose weights are those of its noise."""
+    """Return a window whose weights fit its noise."""
     window = vg.simulate_window(
         options.keyframes, options.points, 0, noise=0.5, depth_error=0.03, host_noise=True, seed=seed
     )
@@ -60,7 +60,7 @@ def _window(seed: int, options: argparse.Namespace) -> SimulatedWindow:
 
 
 def _solver(free: bool):
-    """Errors of the centres, and their NEES, by this package."""
+    """Return the errors of the camera centres and their NEES, by this package."""
 
     @jax.jit
     def adjust(problem: vg.Problem, initial: vg.State):
@@ -85,7 +85,9 @@ def _judged(window: SimulatedWindow, poses: np.ndarray, covariance: np.ndarray) 
 
 
 def _residuals_in_space(step, poses, points, intrinsics, seen, mean, sigma):
-    """Pixels of all points in all cameras, in standard deviations, and the depth in the host."""
+    """Return pixel residuals of all points in all cameras, in standard deviations, and those of the depth in the
+    host.
+    """
     cameras, count = len(poses), len(points)
     moved = jaxlie.SE3.exp(step[: 6 * cameras].reshape(-1, 6)) @ jaxlie.SE3(poses)
     places = points + step[6 * cameras :].reshape(-1, 3)
@@ -97,7 +99,9 @@ def _residuals_in_space(step, poses, points, intrinsics, seen, mean, sigma):
 
 @jax.jit
 def _adjust_in_space(poses, points, *given):
-    """Six Gauss-Newton steps, the first pose held, and the inverse of the last normal matrix."""
+    """Return the result of six Gauss-Newton steps with the first pose fixed, and the inverse of the last normal
+    matrix.
+    """
     zero = jnp.zeros(6 * len(poses) + 3 * len(points))
 
     def normal(poses, points):
@@ -116,7 +120,7 @@ def _adjust_in_space(poses, points, *given):
 
 
 def _in_space(window: SimulatedWindow) -> tuple[np.ndarray, float]:
-    """The same by Gauss-Newton over points in space: the host's pixel is an observation like any other."""
+    """Return the errors and the NEES of points in space, where the host's pixel is an observation like any other."""
     observations, cameras = window.observations, len(window.poses)
     count = len(observations.host)
     seen = np.zeros((cameras, count, 2))
@@ -151,7 +155,7 @@ def _time(options: argparse.Namespace) -> None:
             solution = jax.block_until_ready(solve(*given))
             rows[name].append(1e3 * (time.process_time() - begun) / int(solution.iterations))
     first, second = (np.array(row[1:]) for row in rows.values())
-    print("| host's pixel | ms an iteration, median |\n|---|---|")
+    print("| host's pixel | ms per iteration, median |\n|---|---|")
     print(f"| exact | {np.median(first):.2f} |\n| an unknown | {np.median(second):.2f} |")
     print(f"ratio, median of the rounds: {np.median(second / first):.2f}")
 

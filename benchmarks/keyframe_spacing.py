@@ -1,11 +1,11 @@
-"""How far apart keyframes may be where lengths have no unit: simulated walks without depth, with several limits.
+"""Compare limits on the distance between keyframes, on simulated walks without depth.
 
     .venv/bin/python benchmarks/keyframe_spacing.py [--limits 0.9,5 0.8,10 0.7,10 0.6,15] [--walks 10]
 
-The walks are the healthy ones of the verdict's bank (`verdict_bank.py`, half "set"): rendered worlds with the errors of
-real cameras. A limit is the least overlap and the largest parallax, degrees (`slam/keyframe_decision.py`). Prints for
-each the mean over the walks of the number of keyframes, of seconds, of frames with a pose, and the ATE after Sim(3) in
-% of the path: mean of the logarithms, since walks differ in difficulty, and worst.
+The walks are the healthy ones of `verdict_bank.py` (half "set"): rendered worlds with the errors of real cameras. A
+limit is the least overlap and the largest parallax, degrees (`slam/keyframe_decision.py`). For each limit, the table
+has the mean over the walks of the number of keyframes, of seconds, of frames with a pose, and the ATE after Sim(3) in %
+of the path: worst, and geometric mean, because walks differ in difficulty.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from vggtgeo.simulation.degradations import Recording
 from vggtgeo.slam import keyframe_decision
 
 MANY = 2000
-"""Cases of the bank that are looked through for walks."""
+"""Number of cases of the bank in which walks are searched."""
 
 
 def main() -> None:
@@ -73,7 +73,9 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--limits", nargs="+", default=["0.9,5", "0.8,10", "0.7,10", "0.6,15"])
     parser.add_argument("--walks", type=int, default=10)
-    parser.add_argument("--walks-in", type=Path, default=Path("runs/verdict-bank-walks"), help="where walks are kept")
+    parser.add_argument(
+        "--walks-in", type=Path, default=Path("runs/verdict-bank-walks"), help="folder of rendered walks"
+    )
     return parser.parse_args()
 
 

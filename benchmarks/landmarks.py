@@ -1,13 +1,13 @@
-"""What a point that is one landmark would gain over one inverse depth in every keyframe that sees it.
+"""Compare maps with one landmark per point and with one inverse depth in every keyframe that sees the point.
 
     .venv/bin/python benchmarks/landmarks.py
 
 The map has a landmark for each key point of each keyframe, with its pixel there taken as exact: a point that ten
-keyframes see is ten landmarks, each seen by the nine others. One landmark a point is the maximum of the likelihood. A
-simulated walk past points, tracks of several lengths, independent noise in every image. Both estimates are
-linearised at the truth: with the residuals `r(x, z)` of unknowns `x` and pixels `z`, `dx = -(J'J)^-1 J' G dz`, so their
-covariances are exact for small noise, and need no draws. Prints the RMS error of the camera centres that is left after
-Sim(3) alignment, for a noise of one pixel.
+keyframes see is ten landmarks, each seen by the nine others. Maximum likelihood has one landmark per point. The script
+simulates a walk past points, tracks of several lengths, and independent noise in every image. Both estimates are
+linearised at the true values: with the residuals `r(x, z)` of unknowns `x` and pixels `z`, `dx = -(J'J)^-1 J' G dz`, so
+their covariances are exact for small noise, without sampling. Prints the RMS error of the camera centres after Sim(3)
+alignment, for a noise of one pixel.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def main() -> None:
     """Print a row for each length of tracks."""
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     jax.config.update("jax_enable_x64", True)
-    print("| keyframes that see a point | one landmark, cm | one a keyframe, cm | ratio |\n|---|---|---|---|")
+    print("| keyframes that see a point | one landmark, cm | one per keyframe, cm | ratio |\n|---|---|---|---|")
     for longest in (5, 8, KEYFRAMES):
         poses, points, seen = _walk(longest)
         each = [_error(poses, *system(poses, points, seen)) for system in (_one_landmark, _one_a_keyframe)]
@@ -106,7 +106,7 @@ def _placed(blocks: np.ndarray, columns: np.ndarray, width: int) -> sp.csc_array
 
 def _error(poses: np.ndarray, jacobian: sp.csc_array, noise: sp.csc_array) -> float:
     """Return the RMS error of the centres after Sim(3) alignment, metres, for one pixel of noise."""
-    free = np.r_[7 : jacobian.shape[1]]  # the first pose is held, and the second's step along the walk: the scale
+    free = np.r_[7 : jacobian.shape[1]]  # fixed: the first pose, and the scale by the second's step along the walk
     own = jacobian[:, free]
     moved = -spsolve((own.T @ own).tocsc(), (own.T @ noise).tocsc()).tocsr()
     count = len(poses)

@@ -1,16 +1,17 @@
-"""A confidence learned through bundle adjustment, against uniform, saliency and an oracle, on held-out windows.
+"""Compare a confidence learned through bundle adjustment with uniform, saliency and oracle weights, on held-out
+windows.
 
     python benchmarks/learned_confidence.py
     python benchmarks/learned_confidence.py --slide 5 --seeds 3 --steps 100
     python benchmarks/learned_confidence.py --slide 5 --seeds 3 --steps 100
         --clips ../shared/data/redkitchen ../shared/data/building-walk --held-out ../shared/data/corridor-office
 
-Each seed trains a network of its own (`vggtgeo.learning`) on the same training windows, and compares it on windows of
-rooms and offices that are in no training. Everything is simulated, unless clips with depth and true poses are given.
+Each seed trains one network (`vggtgeo.learning`) on the same training windows, and compares it on windows of rooms and
+offices outside the training set. Everything is simulated, unless clips with depth and true poses are given.
 
-With `--slide` the loss is the pose error at the end of so many slid windows (`vggtgeo.slide`). Clips are adjusted
-without their depth, in the unit of the first two keyframes' distance: depth tells which matches are right, and where
-the inverse depths start.
+With `--slide` the loss is the pose error after that many slid windows (`vggtgeo.slide`). Clips are adjusted without
+their depth, in the unit of the distance between the first two keyframes: depth only tells which matches are right, and
+the start of the inverse depths.
 
 Writes `NAME.png` and `NAME.json` into `--out` (`learned-confidence`, `slid-confidence`) and prints the table.
 """
@@ -45,7 +46,7 @@ from vggtgeo.learning.training import Judge
 
 TRAINING = (("room", 101), ("office", 102), ("staircase", 103), ("room", 104))
 HELD_OUT = (("room", 200), ("office", 300))
-"""Scenes; the seed of the comparison is added to theirs."""
+"""Training and test scenes; the seed of the comparison is added to their seeds."""
 SIZE, FRAMES, WINDOWS = (320, 240), 600, 12
 KEYFRAMES, POINTS = 4, 24
 METHODS = PoseErrors._fields
@@ -58,8 +59,12 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--out", type=Path, default=Path("docs"))
-    parser.add_argument("--slide", type=int, default=1, help="windows that are solved one under the prior of the other")
-    parser.add_argument("--clips", nargs="+", default=[], help="recordings with depth and truth to learn from")
+    parser.add_argument(
+        "--slide", type=int, default=1, help="number of windows, each solved with the prior of the window before"
+    )
+    parser.add_argument(
+        "--clips", nargs="+", default=[], help="recordings with depth and ground truth for the training"
+    )
     parser.add_argument("--held-out", nargs="+", default=[], help="recordings to compare on")
     arguments = parser.parse_args()
     if arguments.clips and (arguments.slide == 1 or not arguments.held_out):
@@ -80,7 +85,7 @@ def main() -> None:
     table = np.array([[row[name] for name in METHODS] for row in rows])
     print(markdown(table))
     facts = {
-        "windows": {"training": len(training.truth), "held out a seed": len(held_out.truth)},
+        "windows": {"training": len(training.truth), "held out per seed": len(held_out.truth)},
         "simulated": not arguments.clips,
     }
     facts |= {"slid": arguments.slide, "loss": np.round(losses, 4).tolist()} if slid else {}
@@ -92,7 +97,7 @@ def main() -> None:
 
 
 def batch_of(scenes: Sequence[tuple[str, int] | str], seed: int, slide: int) -> Batch:
-    """The windows of all scenes or clips, stacked; with `slide` the sequences of so many windows."""
+    """Return the windows of all scenes or clips, stacked; with `slide`, sequences of that many windows."""
     keyframes = KEYFRAMES + slide - 1
     count = WINDOWS // (2 if slide > 1 else 1)
     found: list[TrackedWindow] = []
@@ -111,15 +116,17 @@ def batch_of(scenes: Sequence[tuple[str, int] | str], seed: int, slide: int) -> 
 def one_seed(
     training: Batch, held_out: Batch, seed: int, steps: int, judge: Judge
 ) -> tuple[dict[str, float], list[float]]:
-    """Errors of each method on the held-out windows, millimetres, and the losses of the training."""
+    """Return the errors of each method on the held-out windows, millimetres, and the losses of the training."""
     networks, losses = zip(*train(training, seed=seed, steps=steps, judge=judge), strict=True)
     return compare(held_out, networks[-1], judge).to_dict(), list(losses)
 
 
 def markdown(table: np.ndarray) -> str:
-    """Mean and standard deviation over the seeds, and how far the learned confidence is ahead, seed by seed."""
+    """Return the mean and standard deviation over the seeds, and by how much the learned confidence is better, seed by
+    seed.
+    """
     learned = table[:, METHODS.index("learned")]
-    lines = ["| confidence | pose error, mm | learned is ahead by, mm |", "|---|---|---|"]
+    lines = ["| confidence | pose error, mm | learned is better by, mm |", "|---|---|---|"]
     for name, column in zip(METHODS, table.T, strict=True):
         ahead = "" if name == "learned" else spread(column - learned)
         lines.append(f"| {NAMES[name]} | {spread(column)} | {ahead} |")
@@ -127,12 +134,12 @@ def markdown(table: np.ndarray) -> str:
 
 
 def spread(values: np.ndarray) -> str:
-    """Mean and standard deviation."""
+    """Return the mean and the standard deviation as text."""
     return f"{values.mean():.1f} ± {values.std(ddof=1) if len(values) > 1 else 0.0:.1f}"
 
 
 def draw(table: np.ndarray, losses: np.ndarray, path: Path, source: str) -> None:
-    """The errors seed by seed, and the course of the training."""
+    """Draw the errors seed by seed, and the loss during training."""
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[3, 2])
     colours = {"uniform": "#8a8f98", "saliency": "#c8650b", "learned": "#1f5fbf", "oracle": "#2f7d4f"}
@@ -144,7 +151,7 @@ def draw(table: np.ndarray, losses: np.ndarray, path: Path, source: str) -> None
     left.set_xticks(range(len(METHODS)), [NAMES[name].split(" (")[0] for name in METHODS])
     left.set_ylabel("pose error after adjustment [mm]")
     left.set_ylim(bottom=0)
-    left.set_title(f"held-out windows, a line a seed ({source})", loc="left", fontsize=10)
+    left.set_title(f"held-out windows, one line per seed ({source})", loc="left", fontsize=10)
     width = max(losses.shape[1] // 16, 1)
     smooth = np.apply_along_axis(lambda row: np.convolve(row, np.ones(width) / width, "valid"), 1, losses)
     right.plot(1e3 * np.exp(smooth.T), lw=1.2, color=colours["learned"], alpha=0.7)

@@ -1,12 +1,12 @@
-"""OpenCV's LSD, the trained network M-LSD and no lines in a run.
+"""Compare OpenCV's LSD, the trained network M-LSD and no lines at all in a run.
 
     .venv/bin/python benchmarks/line_detectors.py runs/networks/mlsd.onnx [--data ../shared/data/redkitchen]
         [--out runs/lines] [--end 200]
 
-Only the detector differs: matcher, gates and settings are the defaults. Pictures of the segments of a few frames, LSD
-on the left and M-LSD on the right, go to the output folder. Printed as Markdown: segments a keyframe, matched segments
-a pair of keyframes, ATE RMSE in cm after SE(3) and Sim(3) alignment to the published poses, after Sim(3) to the
-reference, and the detector's milliseconds an image on one thread.
+Only the detector differs: matcher, gates and settings are the defaults. Images of the segments of a few frames, LSD on
+the left and M-LSD on the right, go to the output folder. The Markdown table has segments per keyframe, matched segments
+per pair of keyframes, ATE RMSE in cm after SE(3) and Sim(3) alignment to the published poses, after Sim(3) to the
+reference, and the detector's milliseconds per image on one thread.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from vggtgeo.slam.settings.groups import LineSettings
 from vggtgeo.slam.settings.slam_settings import Roles, SlamSettings
 
 DRAWN = 4
-"""Frames of which a picture is made, spread over the sequence."""
+"""Number of frames that are drawn, evenly spread over the sequence."""
 
 
 def main() -> None:
-    """Draw, run and print the table as it grows."""
+    """Draw, run, and print each row of the table when it is ready."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("mlsd", type=Path, help="M-LSD as `vggtgeo models export mlsd` writes it")
     parser.add_argument("--data", type=Path, default=Path("../shared/data/redkitchen"))
@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def line(name: str, detector: LineDetector | None, data: Path, folder: Path, end: int | None) -> str:
-    """One run, as a line of the table."""
+    """Return the row of one run."""
     roles = Roles() if detector is None else replace(Roles(), lines=detector)
     settings = SlamSettings(line=LineSettings(use_lines=detector is not None))
     result = reconstruct(data, roles, settings, options=RunOptions(end=end))
@@ -76,7 +76,7 @@ def line(name: str, detector: LineDetector | None, data: Path, folder: Path, end
 
 
 def milliseconds(detector: LineDetector, data: Path, count: int = 20) -> float:
-    """Processor milliseconds of the detector on one image."""
+    """Return the processor time of the detector on one image, milliseconds."""
     cv2.setNumThreads(1)
     images = [frame.image for frame in open_sequence(data).frames(0, count, 1)]
     fresh = replace(detector) if isinstance(detector, LsdDetector) else MlsdDetector(detector.session)
@@ -87,7 +87,7 @@ def milliseconds(detector: LineDetector, data: Path, count: int = 20) -> float:
 
 
 def draw(detectors: dict[str, LineDetector], data: Path, out: Path) -> None:
-    """One picture for each of a few frames: the segments of each detector side by side."""
+    """Write an image for each of a few frames: the segments of all detectors side by side."""
     sequence = open_sequence(data)
     for frame in sequence.frames(0, None, max(1, len(sequence) // DRAWN)):
         pictures = [drawn(frame.image, detector.detect(frame.image)) for detector in detectors.values()]
@@ -96,7 +96,7 @@ def draw(detectors: dict[str, LineDetector], data: Path, out: Path) -> None:
 
 
 def drawn(image: np.ndarray, segments: Segments) -> np.ndarray:
-    """The image, paler, with its segments and their ends."""
+    """Return the image, paler, with its segments and their ends."""
     picture = (0.6 * image + 0.4 * 255).astype(np.uint8)
     for first, second in segments.endpoints:
         ends = [tuple(round(16 * value) for value in end) for end in (first, second)]

@@ -1,12 +1,13 @@
-"""A frame's pose from one keyframe: by key points, by line segments alone, by both, with the picture as a whole.
+"""Estimate a frame's pose from one keyframe by points, by line segments, by both, and with the alignment of the whole
+image.
 
     .venv/bin/python benchmarks/line_pairs.py [--data ../shared/data] [--clips corridor-office] [--every 6]
 
-Every n-th frame is a keyframe at its true pose, and the frames 1, 3 and 5 after it are placed from it, from where a
-constant velocity leads. Printed as Markdown: the share of poses within 5 cm and 2 degrees of the truth; the median and
-the 90th percentile of the distance, cm; and how many poses by lines alone are accepted
-(`vggtgeo/slam/tracking/pose_acceptance.py`), of those that are right and of those that are more than 15 cm or 5 degrees
-off. For the latter, segments are also started 0.7 m and 14 degrees away. `few`: pairs of fewer than 100 matches.
+Every n-th frame is a keyframe at its true pose, and the poses of frames 1, 3 and 5 after it are estimated from it,
+starting from the prediction of a constant velocity. The Markdown tables have the share of poses within 5 cm and 2
+degrees of the ground truth; the median and the 90th percentile of the distance, cm; and how many poses by lines alone
+are accepted (`vggtgeo/slam/tracking/pose_acceptance.py`), of the right ones and of those that are more than 15 cm or 5
+degrees wrong. For the latter, lines also start 0.7 m and 14 degrees away. `few`: pairs of fewer than 100 matches.
 """
 
 from __future__ import annotations
@@ -43,12 +44,12 @@ METHODS = {
     "points, picture": (True, False, True),
     "points, lines, picture": (True, True, True),
 }
-"""Whether key points, lines, the picture as a whole take part."""
+"""Which of points, lines and the whole image each method uses."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame with its true pose, world -> camera, and what is found in it once for all pairs."""
+    """A frame with its true pose, world -> camera, and its features, detected once for all pairs."""
 
     frame: Frame
     pose: np.ndarray
@@ -56,28 +57,28 @@ class Shot:
 
     @cached_property
     def features(self) -> Features:
-        """Key points."""
+        """Detect points."""
         return ROLES.points.describe(self.frame.image)
 
     @cached_property
     def blind(self) -> Features:
-        """No key points."""
+        """Return no points."""
         return ROLES.points.describe(np.zeros_like(self.frame.image))
 
     @cached_property
     def lines(self) -> LineFeatures:
-        """Segments."""
+        """Detect line segments."""
         return find_lines(self.frame.image, ROLES, SETTINGS)
 
     @cached_property
     def view(self) -> RgbdView:
-        """What the alignment of the picture needs."""
+        """Prepare the image for its alignment."""
         return RgbdView.of(self.frame.image, ROLES.tracking_depth(self.frame.depth), self.intrinsics)
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two shots `gap` frames apart, and where the motion before the second leads."""
+    """Two shots `gap` frames apart, and the prediction of a constant velocity for the second."""
 
     first: Shot
     second: Shot
@@ -85,7 +86,7 @@ class Pair:
     gap: int
 
     def by(self, method: str, keyframe: Keyframe, expected: MotionPrior | None = None) -> TrackedFrame:
-        """The second shot's pose from the first."""
+        """Estimate the second shot's pose from the first."""
         points, lines, picture = METHODS[method]
         view = self.second.view if picture else None
         features = self.second.features if points else self.second.blind
@@ -98,7 +99,7 @@ class Pair:
 
 
 def main() -> None:
-    """Place all pairs of the clips and print the tables."""
+    """Estimate the poses of all pairs of the clips and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--clips", nargs="+", default=["building-walk", "corridor-office"])
@@ -113,13 +114,13 @@ def main() -> None:
             place(pair, errors, believed)
         for (gap, method), values in errors.items():
             print(line(clip, gap, method, np.array(values)), flush=True)
-    print("\n| poses by lines alone | number | believed |\n|---|---|---|")
+    print("\n| poses by lines alone | number | accepted |\n|---|---|---|")
     for kind, flags in sorted(believed.items()):
         print(f"| {kind} | {len(flags)} | {sum(flags)} |")
 
 
 def pairs(path: Path, every: int) -> Iterator[Pair]:
-    """The pairs of a clip, those of one keyframe together."""
+    """Yield the pairs of a clip, those of one keyframe together."""
     sequence = open_sequence(path)
     truth = sequence.ground_truth()
     assert truth is not None
@@ -138,7 +139,7 @@ def pairs(path: Path, every: int) -> Iterator[Pair]:
 def place(
     pair: Pair, errors: dict[tuple[str, str], list[tuple[float, float]]], believed: dict[str, list[bool]]
 ) -> None:
-    """Place one pair by every method, and by lines from a start that is far off; add to the results."""
+    """Estimate one pair by every method, and by lines from a start that is far off; add to the results."""
     first = pair.first
     keyframe = make_keyframe(
         0, first.frame, first.pose, Description.of(first.features), ROLES, SETTINGS, first.intrinsics, first.lines
@@ -161,14 +162,14 @@ def place(
 
 
 def line(clip: str, gap: str, method: str, errors: np.ndarray) -> str:
-    """A line of the table."""
+    """Return a row of the table."""
     right = 100 * np.mean((errors < NEAR).all(1))
     middle, high = 100 * np.percentile(errors[:, 0], (50, 90))
     return f"| {clip} | {gap} | {method} | {len(errors)} | {right:.0f} % | {middle:.2f} | {high:.2f} |"
 
 
 def _error(pose: np.ndarray, true: np.ndarray) -> tuple[float, float]:
-    """Distance of the centres, metres, and angle, radians."""
+    """Return the distance of the centres, metres, and the angle, radians."""
     return float(np.linalg.norm(rigid.centre(pose) - rigid.centre(true))), rigid.angle_between(pose, true)
 
 

@@ -1,9 +1,9 @@
-"""Measure what a mesh costs that is kept up to date during a run (`vg.callbacks.SurfaceFusion`).
+"""Measure the cost of a mesh that is updated during a run (`vg.callbacks.SurfaceFusion`).
 
     .venv/bin/python benchmarks/live_surface.py ../shared/data/corridor-office [--end 60]
 
-Of updates that made any block anew: how many blocks, and seconds, mean and largest, with the default bound and where
-every motion counts; then all keyframes at once.
+Prints the number of blocks and the seconds (mean and largest) of updates that computed any block again, with the
+default bound and with a bound that reacts to every motion; then the same for all keyframes at once.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import vggtgeo as vg
 
 
 class Surface(vg.Callback):
-    """Keeps a mesh, and what each update of it cost: blocks and seconds."""
+    """Update a mesh, and note blocks and seconds of each update."""
 
     def __init__(self, bound: float) -> None:
         self.bound, self.fusion, self.costs = bound, None, []

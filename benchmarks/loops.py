@@ -1,20 +1,22 @@
-"""Cost of a closed loop of RGB-D keyframes with surfaces: adjustment, derivative and covariances against its length.
+"""Measure a closed loop of RGB-D keyframes with surfaces: the cost of adjustment, derivative and covariances against
+its length.
 
     taskset -c 1 .venv/bin/python benchmarks/loops.py [--keyframes 125 250 500 1000] [--solvers chosen jacobi]
         [--parts solve gradient covariances observability] [--out runs/loops]
 
-The loop is that of `benchmarks/simulated_loop.py`: points, depth priors, aligned surfaces, edges around the loop, and a
-guess that drifts, so that the loop does not close. Each cell is a process of its own, in float64, on one core:
+The loop is that of `benchmarks/simulated_loop.py`: points, depth priors, aligned surfaces, edges around the loop, and
+an initial guess that drifts, so that the loop does not close. Each cell is measured in a separate process, in float64,
+on one core:
 
-- solve: until it converges; time an iteration, the linear solver that the graph chose, and the errors of the camera
-  centres before and after (root mean square).
-- gradient: `jax.value_and_grad` of a loss of the solution by every float leaf; what it takes beyond the solve, in
-  iterations of the solve.
-- covariances: of every pose and landmark, with the same linear algebra, and the error that they expect.
-- observability: at the truth; above 300 keyframes by sparse solvers.
+- solve: until it converges; time per iteration, the linear solver that the graph chose, and the RMS errors of the
+  camera centres before and after.
+- gradient: `jax.value_and_grad` of a loss of the solution by every float leaf; the time beyond the solve, in iterations
+  of the solve.
+- covariances: of every pose and landmark, with the same linear algebra, and the error that they predict.
+- observability: at the true values; above 300 keyframes by sparse solvers.
 
-Time is the median of three runs after the first. Memory is the largest that the process had. The slope is that of a
-straight line through the logarithms of time and edges: 1 is linear. Prints Markdown and writes it to `loops.md`.
+Time is the median of three runs after the first. Memory is the peak of the process. The slope is that of a straight
+line through the logarithms of time and edges: 1 is linear. Prints Markdown and writes it to `loops.md`.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ SOLVERS: dict[str, Callable[[vg.Problem], AbstractReducedSolver]] = {
 }
 PARTS = ("solve", "gradient", "covariances", "observability")
 HEADER = (
-    "| keyframes | edges | surfaces | linear solver | iterations | ms an iteration | error before, mm | after, mm "
+    "| keyframes | edges | surfaces | linear solver | iterations | ms per iteration | error before, mm | after, mm "
     "| expected, mm | backward, iterations | covariances, s | observability, s "
     "| memory GB: solve | gradient | covariances | observability |\n" + "|---" * 16 + "|"
 )
@@ -83,7 +85,7 @@ def _options() -> argparse.Namespace:
 
 
 def _row(keyframes: int, solver: str, parts: list[str]) -> dict[str, Any]:
-    """All cells of one size, each in a process of its own."""
+    """Return all cells of one size, each measured in a separate process."""
     row: dict[str, Any] = {"solver": solver}
     for part in parts:
         command = [sys.executable, __file__, "--cell", str(keyframes), solver, part]
@@ -152,7 +154,7 @@ def _observability(problem: vg.Problem, state: vg.State, _: Any, __: AbstractRed
 
 
 def _timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    """Milliseconds of a compiled run, and what it returned."""
+    """Return the milliseconds of a compiled run, and its result."""
     return _timed_run(jax.jit(function), *arguments)
 
 

@@ -1,13 +1,13 @@
-"""Dense maps against truth: the table of docs/guides/dense-maps.md.
+"""Compare dense maps with the ground truth: the table of docs/guides/dense-maps.md.
 
     .venv/bin/python benchmarks/maps.py [--only office] [--data ../shared/data] [--out runs/maps] [--frames 100]
 
-`office` is the simulated office with sensor-like depth, `office-rgb` the same without depth; the truth are the exact
-depth images of every second frame. `redkitchen-rgb` is the real clip without depth, against the depth camera's own
-cloud at the published poses (which are several cm off themselves). Maps of free scale are aligned by the trajectories,
-Sim(3), the others SE(3). Printed as Markdown: points, F-score, precision and recall at 5 cm of the mesh, mean distance
-of the cloud's points, of `NEES` the mean squared error of depth in standard deviations (of what is within five), and
-seconds of the dense map. Cloud and mesh go to the output folder.
+`office` is the simulated office with sensor-like depth, `office-rgb` the same without depth; their ground truth is the
+exact depth of every second frame. `redkitchen-rgb` is the real clip without depth, compared with the depth camera's
+cloud at the published poses (which are several cm wrong). Maps of unknown scale are aligned by the trajectories,
+Sim(3), the others SE(3). The Markdown table has points, F-score, precision and recall at 5 cm of the mesh, mean
+distance of the cloud's points, NEES (mean squared error of depth over its variance, of errors within five standard
+deviations), and seconds of the dense map. Cloud and mesh go to the output folder.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.simulation import SyntheticSequence
 
 CELL = 0.02
-"""Metres between the points of the truth."""
+"""Distance between the points of the ground truth, metres."""
 SPACING = 0.02
 FARTHEST = 5.0
-"""Metres: the noise of a Kinect's depth is above 4 cm from here on."""
+"""Largest depth, metres: a Kinect's noise is above 4 cm beyond it."""
 
 
 def main() -> None:
-    """Run each and print its row."""
+    """Run each case and print its row."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", help="office, office-rgb or redkitchen-rgb")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def row(name: str, arguments: argparse.Namespace) -> str:
-    """One line of the table."""
+    """Return one row of the table."""
     kind = name.removesuffix("-rgb")
     simulated = kind == "office"
     sequence = vg.simulate(kind, arguments.frames, 0, rate=10.0) if simulated else vg.read(arguments.data / kind)
@@ -70,13 +70,13 @@ def row(name: str, arguments: argparse.Namespace) -> str:
 
 
 def _exact(sequence: SyntheticSequence) -> Iterator[np.ndarray]:
-    """World points of the renderer's depth, of every second frame."""
+    """Return world points of the renderer's depth, of every second frame."""
     for index in range(0, len(sequence), 2):
         yield _points(sequence.picture(index).depth, sequence.pose(index), np.array(sequence.camera.intrinsics))
 
 
 def _measured(sequence: Sequence) -> Iterator[np.ndarray]:
-    """World points of the depth camera at the published poses, of every fifth frame."""
+    """Return world points of the depth camera at the published poses, of every fifth frame."""
     truth = sequence.ground_truth()
     for frame in sequence.frames(0, None, 5):
         pose = _pose_of(frame, truth)
@@ -103,7 +103,9 @@ def _thinned(points: np.ndarray) -> np.ndarray:
 
 
 def _nees(result: vg.Result, sequence: SyntheticSequence, scale: float) -> float:
-    """Mean squared error of the depth maps in their own standard deviations, of what is within five of them."""
+    """Return the mean squared error of the depth maps over their stated variance, of errors within five standard
+    deviations.
+    """
     squares = []
     for keyframe, depth_map in zip(result.record.slam.keyframes, result.record.dense.depth_maps, strict=True):
         if depth_map is not None:

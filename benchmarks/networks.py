@@ -1,17 +1,17 @@
-"""Every network, exported with random weights (M-LSD with its own) and run: the table of docs/guides/networks.md.
+"""Export every network with random weights (M-LSD: trained ones) and run it: the table of docs/guides/networks.md.
 
     .venv/bin/python benchmarks/networks.py --checkouts FOLDER [--out runs/networks] [--only dinov3] [--threads 1]
     .venv/bin/python benchmarks/networks.py --checkouts FOLDER --out runs/gpu --provider cuda --views 10 [--half]
 
-FOLDER holds checkouts of the networks' code, one folder each, under any name. Files that exist are not exported
-again. Each export and each measurement is a process of its own; memory is the largest resident memory of it.
-Printed as Markdown. Disk needed: 13 GB; memory: 8 GB (VGGT).
+FOLDER holds checkouts of the networks' code, one folder each, under any name. Existing files are not exported again.
+Each export and each measurement runs in a separate process; memory is its peak resident memory. Prints Markdown. Disk
+needed: 13 GB; memory: 8 GB (VGGT).
 
-With `--provider cuda` a call is timed by the clock, the memory is the GPU's, as nvidia-smi sees it rise (so nothing
-else may use that GPU), and the line after the table is the whole front end: all networks of the paper's preset
-loaded together, every role asked once a frame of a simulated walk. `--front-end` prints that line alone, on any
-provider. `--against-cpu` prints instead how far the provider's answers are from the CPU's, as the program runs networks
-and in TF32, as onnxruntime would.
+With `--provider cuda` a call is timed by the wall clock, memory is the rise of the GPU's memory in nvidia-smi (so no
+other program may use that GPU), and the line after the table is the whole front end: all networks of the paper's preset
+loaded together, every role called once per frame of a simulated walk. `--front-end` prints that line alone, on any
+provider. `--against-cpu` prints instead the difference between the provider's answers and the CPU's, with the program's
+precision and with TF32, onnxruntime's default.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ PAPER_GB = 21.2
 
 @dataclass(frozen=True)
 class Row:
-    """One export: file name, network, options, and the input as words."""
+    """One export: file name, network, options, and the input in words."""
 
     name: str
     network: str
@@ -81,17 +81,17 @@ HEADINGS = (
 
 
 def main() -> None:
-    """Export and measure what was asked for, and print the table as it grows."""
+    """Export and measure the chosen networks, and print each row when it is ready."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--checkouts", type=Path)
     parser.add_argument("--out", type=Path, default=Path("runs/networks"))
-    parser.add_argument("--only", help="one file's name")
+    parser.add_argument("--only", help="name of one file")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--provider", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--views", type=int, default=2, help="images a window of VGGT")
+    parser.add_argument("--views", type=int, default=2, help="images per window of VGGT")
     parser.add_argument("--half", action="store_true", help="half precision where a network has it")
     parser.add_argument(
-        "--front-end", type=int, metavar="FRAMES", help="only time all roles together on so many frames"
+        "--front-end", type=int, metavar="FRAMES", help="only time all roles together on this number of frames"
     )
     parser.add_argument("--against-cpu", action="store_true", help="only compare the files of --out with the CPU")
     parser.add_argument("--measure", type=Path, help=argparse.SUPPRESS)  # the process that measures one file
@@ -124,7 +124,9 @@ def main() -> None:
 
 
 def rows(views: int, half: bool) -> Iterator[Row]:
-    """The rows with these views in VGGT's window and, where there is such an export, in half precision."""
+    """Return the rows with this number of views in VGGT's window and, where such an export exists, in half
+    precision.
+    """
     for row in ROWS:
         options, size = row.options, row.size
         if row.network == "vggt":
@@ -135,13 +137,15 @@ def rows(views: int, half: bool) -> Iterator[Row]:
 
 
 def exported(row: Row, checkouts: Path, out: Path, threads: int) -> dict:
-    """What `vggtgeo models export --json` said of the row's file, now or when it was written."""
+    """Return the output of `vggtgeo models export --json` for the row's file, from now or from when it was written."""
     kept = out / f"{row.name}.json"
     if kept.is_file() and (out / f"{row.name}.onnx").is_file():
         return json.loads(kept.read_text())
     source = RECIPES[row.network].checkout.find(checkouts)
     if source is None:
-        raise SystemExit(f"`--checkouts` {checkouts} holds no checkout of {RECIPES[row.network].checkout.repository}")
+        raise SystemExit(
+            f"`--checkouts` must contain a checkout of {RECIPES[row.network].checkout.repository}, got {checkouts}"
+        )
     carried = source / "models/mlsd_tiny_512_fp32.pth"
     weights = ["--checkpoint", carried] if carried.is_file() else ["--random-weights"]
     program = Path(sys.executable).with_name("vggtgeo")
@@ -155,7 +159,9 @@ def exported(row: Row, checkouts: Path, out: Path, threads: int) -> dict:
 
 
 def in_own_process(arguments: argparse.Namespace, what: str, value: str) -> dict:
-    """What `--measure FILE` or `--front-end FRAMES` prints; memory is the process's, unless it is the GPU's."""
+    """Return the output of this script with `--measure FILE` or `--front-end FRAMES`, and the peak memory: of the
+    process, or of the GPU.
+    """
     common = ["--threads", str(arguments.threads), "--provider", arguments.provider, "--out", str(arguments.out)]
     process = subprocess.Popen([sys.executable, __file__, what, value, *common], stdout=subprocess.PIPE)
     assert process.stdout is not None
@@ -167,7 +173,7 @@ def in_own_process(arguments: argparse.Namespace, what: str, value: str) -> dict
 
 
 def measure(file: Path, threads: int, provider: str) -> dict:
-    """Median seconds of a call after a first one; on the CPU those of the processor, on an idle machine its latency."""
+    """Return the median seconds of a call after the first; on the CPU processor seconds."""
     import numpy as np
     import onnxruntime
 
@@ -191,7 +197,9 @@ def measure(file: Path, threads: int, provider: str) -> dict:
 
 
 def against_cpu(file: Path, provider: str) -> dict[str, dict[str, float]]:
-    """Largest difference of each output from the CPU's, relative to its largest value, in float32 and in TF32."""
+    """Return the largest difference of each output from the CPU's, relative to its largest value, in float32 and in
+    TF32.
+    """
     import numpy as np
     import onnxruntime
 
@@ -213,7 +221,9 @@ def against_cpu(file: Path, provider: str) -> dict[str, dict[str, float]]:
 
 
 def front_end(folder: Path, frames: int, provider: str) -> dict:
-    """Frames a second with every role of the paper's preset asked once a frame; seconds and calls of each network."""
+    """Run every role of the paper's preset once per frame; return frames per second, and seconds and calls of each
+    network.
+    """
     import numpy as np
     from vggtgeo.models.roles import PoseQuery
 
@@ -246,7 +256,7 @@ def front_end(folder: Path, frames: int, provider: str) -> dict:
 
 @contextlib.contextmanager
 def gpu_memory(provider: str) -> Iterator[dict[str, float]]:
-    """While the block runs, how far the GPU's memory rises, as `gigabytes`; nothing on the CPU."""
+    """Measure the rise of the GPU's memory during the block, as `gigabytes`; nothing on the CPU."""
     risen: dict[str, float] = {}
     if provider == "cpu":
         yield risen
@@ -267,13 +277,13 @@ def gpu_memory(provider: str) -> Iterator[dict[str, float]]:
 
 
 def gpu_megabytes() -> float:
-    """Memory in use on the first GPU."""
+    """Return the memory in use on the first GPU."""
     command = ["nvidia-smi", "--id=0", "--query-gpu=memory.used", "--format=csv,noheader,nounits"]
     return float(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
 
 
 def line(row: Row, report: dict, run: dict) -> str:
-    """One line of the table."""
+    """Return one row of the table."""
     cells = (
         f"`{row.name}`",
         row.size,

@@ -1,4 +1,4 @@
-"""Images alone, of a camera that nobody calibrated: what focal length and lens come out, and what the path is worth.
+"""Run clips without their calibration, and compare the estimated focal length, lens and path with the true ones.
 
     D=../shared/data
     .venv/bin/python benchmarks/no_calibration.py $D/redkitchen --truth $D/redkitchen/reference-colmap.txt
@@ -9,14 +9,14 @@ A lens that bends corners by 65 px:
     ../shared/stress/make_variants.py make $D/redkitchen runs/lens distorted --frames 100
     .venv/bin/python benchmarks/no_calibration.py runs/lens/distorted --truth runs/lens/distorted.truth.txt
 
-Images that were resized out of shape, to three quarters of their width, as widescreen that is stored as 4:3, and to
-pixels of 0.9 as those of tapes, here the first 60 frames:
+Images that were resized without keeping their shape, to three quarters of their width, as widescreen video stored as
+4:3, and to pixels of 0.9 as those of tapes, here the first 60 frames:
 
     .venv/bin/python benchmarks/no_calibration.py $D/corridor-office $D/redkitchen --end 60 --width 0.75
     .venv/bin/python benchmarks/no_calibration.py $D/corridor-office $D/redkitchen --end 60 --width 0.9 --depth
 
-Calibration and, but for `--depth`, depth of the clips are hidden from the run; the calibration stands beside what was
-found.
+The calibration and, without `--depth`, the depth of the clips are hidden from the run; the table has the calibration
+beside the estimate.
 """
 
 from __future__ import annotations
@@ -63,16 +63,18 @@ def main() -> None:
 
 
 def _focal(intrinsics: Sequence[float]) -> str:
-    """Of fx and fy, where they differ, both."""
+    """Return the focal length, or fx and fy where they differ."""
     return ", ".join(dict.fromkeys(f"{value:.1f}" for value in intrinsics[:2]))
 
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", type=Path, nargs="+")
-    parser.add_argument("--truth", type=Path, help="of the one clip that is given, in place of its own (TUM format)")
+    parser.add_argument("--truth", type=Path, help="ground truth (TUM format) to use instead of that of the only clip")
     parser.add_argument("--end", type=int, help="frame to stop before")
-    parser.add_argument("--width", type=float, default=1.0, help="of the images, of what it was; their height stays")
+    parser.add_argument(
+        "--width", type=float, default=1.0, help="new width of the images over the old one; their height stays"
+    )
     parser.add_argument("--depth", action="store_true", help="with measured depth")
     options = parser.parse_args()
     if options.truth and len(options.clips) > 1:

@@ -1,15 +1,15 @@
-r"""Views that no run has used, drawn by two sets of poses: are those of a run as good as COLMAP's own?
+"""Render frames that were set aside, from the depth of other frames, by the poses of a run and by those of COLMAP.
 
     D=../shared/data/redkitchen
     .venv/bin/vggtgeo run $D -o runs/redkitchen
     .venv/bin/python benchmarks/novel_views.py $D runs/redkitchen/trajectory.txt $D/reference-colmap.txt \
         --pictures runs/views
 
-Every `--apart`-th frame is set aside. Of the others every `--every`-th gives its pixels with the sensor's depth as
-coloured points, by either set of poses (the first is brought to the second by Sim(3), as the scale of either may be
-free). The points of the whole clip are drawn into each frame that was set aside: the nearest surface of each pixel, the
-mean of its points' colours. Pose errors anywhere in the clip blur these pictures. PSNR against the frame itself, over
-the pixels that both sets cover. Nothing is trained: what differs is the poses alone.
+Every `--apart`-th frame is set aside. Of the others every `--every`-th gives coloured points by its pixels and the
+sensor's depth, by either set of poses (the first is aligned to the second by Sim(3), as the scale of either may be
+unknown). The points of the whole clip are rendered into each frame that was set aside: in each pixel the nearest
+surface, the mean of its points' colours. Pose errors anywhere in the clip blur these images. The PSNR against the frame
+is over the pixels that both sets cover. Nothing is trained: only the poses differ.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from vggtgeo.geometry import rigid
 from vggtgeo.geometry.trajectory import Trajectory
 
 HALF = 2
-"""Pictures are halved: a depth camera's points are about as dense as that."""
+"""Images have half the size, which fits the density of a depth camera's points."""
 SURFACE = 0.02
-"""Relative: points so little behind the nearest one of their pixel are of the same surface."""
+"""Largest relative distance behind the nearest point of a pixel that counts as the same surface."""
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A halved frame: colour float32 [h, w, 3], depth [h, w] in metres, NaN = none."""
+    """A frame at half size: colour float32 [h, w, 3], depth [h, w] in metres, NaN = none."""
 
     timestamp: float
     colour: np.ndarray
@@ -78,7 +78,7 @@ def main() -> None:
 
 
 def _rows(times: list[float], wanted: np.ndarray) -> np.ndarray:
-    """The picture of each pose."""
+    """Return the picture of each pose."""
     return np.abs(np.subtract.outer(wanted, np.array(times))).argmin(1)
 
 
@@ -92,7 +92,7 @@ def _halved(frame: vg.data.Frame) -> Picture:
 def _cloud(
     pictures: list[Picture], rows: np.ndarray, sources: np.ndarray, poses: np.ndarray, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """World points float32 [n, 3] and their colours [n, 3]."""
+    """Return world points float32 [n, 3] and their colours [n, 3]."""
     points, colours = [], []
     for row in sources:
         picture = pictures[rows[row]]
@@ -108,7 +108,7 @@ def _cloud(
 def _drawn(
     cloud: tuple[np.ndarray, np.ndarray], pose: np.ndarray, intrinsics: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
-    """What a camera at `pose` (camera -> world) sees of the points, float64 [h, w, 3]; NaN where there is none."""
+    """Render the points from `pose` (camera -> world), float64 [h, w, 3]; NaN where no point is."""
     points, colours = cloud
     world_to_camera = rigid.invert(pose)
     local = points @ world_to_camera[:3, :3].T.astype(np.float32) + world_to_camera[:3, 3].astype(np.float32)
@@ -129,7 +129,7 @@ def _drawn(
 
 
 def _save(path: Path, pictures: list[np.ndarray]) -> None:
-    """Side by side: the frame, by these poses, by the reference's."""
+    """Write the frame, the view by these poses and the view by the reference's side by side."""
     path.parent.mkdir(parents=True, exist_ok=True)
     row = np.concatenate([np.nan_to_num(picture) for picture in pictures], axis=1)
     cv2.imwrite(str(path), cv2.cvtColor(row.astype(np.uint8), cv2.COLOR_RGB2BGR))
@@ -140,9 +140,9 @@ def _options() -> argparse.Namespace:
     parser.add_argument("clip", type=Path, help="a sequence with depth")
     parser.add_argument("poses", type=Path, help="a run's trajectory (TUM format)")
     parser.add_argument("reference", type=Path, help="the poses to compare with (TUM format)")
-    parser.add_argument("--apart", type=int, default=10, help="every so many-th frame is set aside")
-    parser.add_argument("--every", type=int, default=3, help="every so many-th of the others gives its points")
-    parser.add_argument("--pictures", type=Path, help="folder for the frames beside what was drawn")
+    parser.add_argument("--apart", type=int, default=10, help="set aside every n-th frame")
+    parser.add_argument("--every", type=int, default=3, help="take the points of every n-th of the others")
+    parser.add_argument("--pictures", type=Path, help="folder for the frames beside their rendered views")
     return parser.parse_args()
 
 

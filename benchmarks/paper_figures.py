@@ -35,11 +35,11 @@ from vggtgeo.slam.settings.table import updated
 from vggtgeo.slam.state import Slam
 
 STEP = 3
-"""Pixels between the sampled ones of a depth map."""
+"""Step between sampled pixels of a depth map."""
 ROWS = 3
 """Keyframes in Figure 7."""
 MAX_ERROR = 0.2
-"""Metres, at the end of the scale of errors in Figure 7."""
+"""End of the scale of errors in Figure 7, metres."""
 
 
 @dataclass

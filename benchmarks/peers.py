@@ -1,16 +1,16 @@
-"""One window, ours and its peers: time an iteration, and energy against time, interleaved on one core.
+"""Compare this solver with others on one window: time per iteration, and energy against time, interleaved on one core.
 
     .venv/bin/python benchmarks/peers.py [--sizes small medium large] [--rounds 5] [--core 0] [--out runs/peers]
         [--bench ../shared/bench] [--jaxls-python PYTHON]
 
-The problems come from `problems.py` of the bench folder. Its C++ peers (Ceres with analytic derivatives and cached
+The problems come from `problems.py` of the bench folder. Its C++ solvers (Ceres with analytic derivatives and cached
 edges; a hand-written solver of the same algorithm) are built where cmake, Ceres and Eigen are installed, and left out
-where not. In every round each solver runs once, 50 iterations in float64 and one thread, so that what else the machine
-does hits all of them; figures are medians over the rounds, ratios are medians of the rounds' ratios. jaxls is measured
-when a Python is given that has it (three runs after one another: it takes a minute to compile). All solve the same
-problem without bounds; our rows say where inverse depths are kept positive, as `solve` does by default, and where the
-columns are derived from the residuals by automatic differentiation, as a user's own term has them.
-Writes `peers.md`, `peers.json` and `energy.png`.
+otherwise. In every round each solver runs once, 50 iterations in float64 and one thread, so that other load on the
+machine affects all of them; figures are medians over the rounds, ratios are medians of the rounds' ratios. jaxls is
+measured when a Python with it is given (three runs in a row: it takes a minute to compile). All solve the same problem
+without bounds; the rows of this solver tell where inverse depths are kept positive, the default of `solve`, and where
+the columns come from automatic differentiation of the residuals, as for a user's term. Writes `peers.md`, `peers.json`
+and `energy.png`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ OURS = {
 
 
 class Worker:
-    """A Python process that compiles a solve once and runs it when told."""
+    """A Python process that compiles a solve once and runs it on request."""
 
     def __init__(self, problem: Path, flags: dict[str, Any]):
         command = [sys.executable, __file__, "--worker", str(problem), json.dumps(flags)]
@@ -96,10 +96,10 @@ def _options() -> argparse.Namespace:
 
 
 def _build(bench: Path, folder: Path) -> dict[str, list[str]]:
-    """The command line of each C++ peer that could be built."""
+    """Return the command line of each C++ solver that could be built."""
     for command in (["cmake", "-S", str(bench), "-B", str(folder)], ["cmake", "--build", str(folder)]):
         if subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode:
-            print("the C++ peers could not be built; they are left out", file=sys.stderr)
+            print("the C++ solvers could not be built and are left out", file=sys.stderr)
             return {}
     count = str(ITERATIONS)
     ceres = [
@@ -123,7 +123,9 @@ def _build(bench: Path, folder: Path) -> dict[str, list[str]]:
 
 
 def _measure(size: str, binaries: dict[str, list[str]], options: argparse.Namespace) -> dict[str, Any]:
-    """Rows of one size by solver: the rounds' times an iteration, energies, and for ours the compile time."""
+    """Return rows of one size by solver: times per iteration and energies of the rounds, and the compile time of this
+    solver.
+    """
     folder = options.out / "problems"
     problem = folder / f"{size}.npz"
     if not problem.exists():
@@ -153,7 +155,7 @@ def _peer(command: list[str], problem: Path) -> dict[str, Any]:
     *lines, last = text.splitlines()
     summary = json.loads(last)
     history = [float(found) for line in lines for found in re.findall(r"cost (\S+)", line)]
-    if len(history) == summary["iters"]:  # the start is not listed
+    if len(history) == summary["iters"]:  # the energy of the start is missing
         history = [summary["c0"], *history]
     return {"ms": summary["ms_per_iter"], "history": history}
 
@@ -167,7 +169,7 @@ def _jaxls(options: argparse.Namespace, folder: Path, size: str) -> dict[str, An
 
 
 def _work(path: Path, flags: dict[str, Any]) -> None:
-    """Compile, say how long it took, then run for every line of standard input."""
+    """Compile, print how long it took, then run once for every line of standard input."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -180,7 +182,7 @@ def _work(path: Path, flags: dict[str, Any]) -> None:
     problem, state, _ = load_problem(path, flags.get("dtype", "float64"))
     problem = dataclasses.replace(problem, positive_depth=flags.get("positive_depth", False))
     if flags.get("derived"):
-        # The hand-written derivatives serve the pinhole itself; a subclass is a camera that they do not know.
+        # The hand-written derivatives serve the pinhole itself; a subclass gets automatic derivatives.
         problem = dataclasses.replace(problem, camera=type("AnyPinhole", (Pinhole,), {}))
     correction = flags.get("max_correction", SchurLevenbergMarquardt.max_correction)
     solver = SchurLevenbergMarquardt(max_iterations=ITERATIONS, rtol=0.0, max_correction=correction)
@@ -197,7 +199,7 @@ def _work(path: Path, flags: dict[str, Any]) -> None:
 
 
 def _best(rows: dict[str, Any]) -> float:
-    """Least energy of the rows in double precision."""
+    """Return the least energy of the rows in double precision."""
     return min(min(row["history"]) for name, row in rows.items() if "float32" not in name)
 
 
@@ -207,7 +209,7 @@ def _table(size: str, rows: dict[str, Any]) -> str:
     lines = [
         f"{size}: best energy {best:.9e}",
         "",
-        "| solver | ms an iteration | times faster than Ceres | energy after 50, above best | above Ceres after 50 "
+        "| solver | ms per iteration | times faster than Ceres | energy after 50, above best | above Ceres after 50 "
         "| most above Ceres, iterations 2 to 50 | iterations, ms to 1e-4 | compile s |",
         "|---|---|---|---|---|---|---|---|",
     ]
@@ -230,7 +232,7 @@ def _table(size: str, rows: dict[str, Any]) -> str:
 
 
 def _draw(results: dict[str, Any], path: Path) -> None:
-    """Energy above the best known against time, one panel a size."""
+    """Draw the energy above the best known against time, one panel for each size."""
     import matplotlib
 
     matplotlib.use("Agg")

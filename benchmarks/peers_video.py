@@ -1,15 +1,16 @@
-"""Videos without depth, ours and COLMAP's: who places how many frames, in how many submaps, how well, and how fast?
+"""Compare this system with COLMAP on videos without depth: frames with a pose, submaps, accuracy and time.
 
     .venv/bin/python benchmarks/peers_video.py ../shared/data/balcony ../shared/data/building-walk [--stride 2]
         [--mapping incremental global] [--seeds 0 1] [--frames 0 302] [--no-ours] [--unknown-camera]
 
-COLMAP (the extra with pycolmap) gets the frames that ours gets, the same camera (held; with `--unknown-camera` neither
-gets one), pairs of frames up to 10 apart, and for each frame the 10 others, farther apart, that look most like it by
-our global descriptor. Its options are its defaults. Matches are made once a clip, and every seed maps them again.
+COLMAP (the extra with pycolmap) gets the same frames, the same camera (fixed; with `--unknown-camera` neither gets
+one), pairs of frames up to 10 apart, and for each frame the 10 others, farther apart, that are most similar by this
+system's global descriptor. Its options are its defaults. Matches are made once per clip, and mapped again with every
+seed.
 
-A row a run: frames in the largest submap and in all; submaps; ATE of the largest submap after Sim(3) in cm, or in
-hundredths of the truth's unit, and in % of its path; seconds. Below, for each two runs of COLMAP, how far they are
-apart, likewise.
+The table has a row for each run: frames in the largest submap and in all; submaps; ATE of the largest submap after
+Sim(3) in cm, or in hundredths of the ground truth's unit, and in % of its path; seconds. Below, the same distance
+between each two runs of COLMAP.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from vggtgeo.slam.run import default_roles, finish, frame_trajectory, run
 from vggtgeo.slam.state import submaps_by_size
 
 NEIGHBOURS, ALIKE = 10, 10
-"""Frames before and after one, and others, that it is matched with."""
+"""Number of near frames, on each side, and of similar frames with which a frame is matched."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +117,7 @@ def _colmap(frames: list[Frame], sequence: Sequence, folder: Path, options: argp
 
 
 def _mapped(
-    mapping: str, database: Path, images: Path, out: Path, seed: int, held: bool
+    mapping: str, database: Path, images: Path, out: Path, seed: int, known: bool
 ) -> dict[int, pycolmap.Reconstruction]:
     out.mkdir()
     pycolmap.set_random_seed(seed)
@@ -126,13 +127,13 @@ def _mapped(
         return dict(pycolmap.global_mapping(database, images, out, whole))
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed = seed
-    if held:
+    if known:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
     return dict(pycolmap.incremental_mapping(database, images, out, options))
 
 
 def _camera(sequence: Sequence) -> tuple[str, list[float]]:
-    """Model and parameters of a camera as COLMAP has them: the centre of its first pixel is at 0.5, 0.5."""
+    """Return model and parameters of a camera as COLMAP has them: the centre of its first pixel is at 0.5, 0.5."""
     fx, fy, cx, cy = sequence.camera.intrinsics
     pinhole = [fx, fy, cx + 0.5, cy + 0.5]
     lens = list(sequence.camera.distortion)
@@ -144,7 +145,7 @@ def _camera(sequence: Sequence) -> tuple[str, list[float]]:
 
 
 def _pairs(frames: list[Frame]) -> set[tuple[int, int]]:
-    """Frames near each other, and those farther apart that look alike."""
+    """Return pairs of frames that are near each other, and of distant frames that look alike."""
     count, matcher = len(frames), SiftMatcher()
     pairs = {(row, other) for row in range(count) for other in range(row + 1, min(row + NEIGHBOURS + 1, count))}
     vectors = [global_descriptor(matcher.describe(frame.image)) for frame in frames]
@@ -176,7 +177,9 @@ def _row(clip: str, run: Run, truth: Trajectory, frames: int) -> str:
 
 
 def _error(estimate: Trajectory, truth: Trajectory) -> tuple[float, float]:
-    """ATE after Sim(3), in hundredths of the truth's unit and in % of its path, over the frames that both have."""
+    """Return the ATE after Sim(3), in hundredths of the ground truth's unit and in % of its path, over the frames that
+    both have.
+    """
     error = absolute_error(*associate(estimate, truth), "sim3").statistics.rmse
     path = np.linalg.norm(np.diff(truth.positions, axis=0), axis=1).sum()
     return 100 * float(error), 100 * float(error / path)
@@ -189,8 +192,8 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--frames", type=int, nargs=2, default=(0, None), metavar=("FIRST", "PAST"))
     parser.add_argument("--mapping", nargs="*", choices=("incremental", "global"), default=["incremental"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--no-ours", dest="ours", action="store_false", help="COLMAP alone")
-    parser.add_argument("--unknown-camera", action="store_true", help="neither is given the camera")
+    parser.add_argument("--no-ours", dest="ours", action="store_false", help="run COLMAP only")
+    parser.add_argument("--unknown-camera", action="store_true", help="let both systems estimate the camera")
     return parser.parse_args()
 
 

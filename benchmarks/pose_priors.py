@@ -1,12 +1,12 @@
-"""Recorded poses as a prior: a clip without depth, some seconds of it black, with none, with the truth disturbed as a
-phone's poses are, and with poses of another recording.
+"""Measure what recorded poses give as a prior: a clip without depth, some seconds of it black, with no prior, with a
+disturbed ground truth like a phone's poses, and with poses of another recording.
 
     .venv/bin/python benchmarks/pose_priors.py ../shared/data/building-walk [--black 10 2] [--priors none own other]
         [--other ../shared/data/corridor-office] [--frames 0 240] [--depth] [--seed 0]
 
-own: the truth in another world, with 2 % of the path drift, 1 degree a minute, and 5 % too long. other: the poses of
-another clip at the times of this one. evidence: logarithm of the ratio of likelihoods. ATE after Sim(3), cm, over the
-frames that have a pose in the largest submap. lengths: of the map, over the true ones.
+own: the ground truth in another world, with drift of 2 % of the path and 1 degree per minute, and 5 % too long. other:
+the poses of another clip at the times of this one. evidence: logarithm of the ratio of likelihoods. ATE after Sim(3),
+cm, over the frames that have a pose in the largest submap. lengths: of the map, over the true ones.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def disturbed(truth: Trajectory) -> Trajectory:
-    """The truth as a phone might record it."""
+    """Return the ground truth with the errors of a phone's poses."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth.positions, axis=0), axis=1))])
     since = truth.timestamps - truth.timestamps[0]
     poses = truth.poses.copy()
@@ -93,7 +93,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("clip", type=Path)
     parser.add_argument("--black", type=float, nargs=2, metavar=("FROM", "SECONDS"), help="black frames, seconds")
     parser.add_argument("--priors", nargs="+", choices=("none", "own", "other"), default=["none", "own"])
-    parser.add_argument("--other", type=Path, help="another clip, for its poses")
+    parser.add_argument("--other", type=Path, help="another clip, whose poses are used")
     parser.add_argument("--frames", type=int, nargs=2, default=(0, None), metavar=("FIRST", "PAST"))
     parser.add_argument("--depth", action="store_true", help="with the clip's depth")
     parser.add_argument("--seed", type=int, default=0)

@@ -1,12 +1,12 @@
-"""Pieces of clips, degraded at random: how many come out right, how many say that they do not, how many lie.
+"""Degrade sections of clips at random, and count right results, reported failures and unreported wrong results.
 
     .venv/bin/python benchmarks/random_degradations.py ../shared/data/* --seeds 0 8 [--jobs 2] [--out runs/random]
 
-A seed is a piece of one clip (40 to 90 frames from anywhere), as it is with and without depth, and six times with two
-or three things done to it that are drawn at random, with their strength. What `benchmarks/stress.py` degrades is a list
-that the checks have seen; this one never ends. A seed draws the same always: `--seeds 5 6` runs seed 5 again.
+A seed is a section of one clip (40 to 90 frames from anywhere), undisturbed with and without depth, and six times with
+two or three random changes of random strength. `benchmarks/stress.py` has a fixed list of changes, which was used to
+develop the checks; here they are unlimited. A seed always gives the same cases: `--seeds 5 6` runs seed 5 again.
 
-The words of the table are those of `benchmarks/stress.py`; a case is compared with the same piece as it is.
+The words of the table are those of `benchmarks/stress.py`; a case is compared with the same undisturbed section.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Change = Callable[[Recording], Recording]
 
 @dataclass(frozen=True)
 class Piece:
-    """Frames of a clip: which, and how many."""
+    """A section of a clip."""
 
     clip: Path
     first: int
@@ -49,7 +49,7 @@ class Piece:
 
     @property
     def name(self) -> str:
-        """For the table."""
+        """Return the name for the table."""
         return f"{self.clip.name} {self.first}-{self.first + self.count - 1}"
 
 
@@ -72,7 +72,7 @@ def main() -> None:
 
 
 def _cases(seed: int, clips: list[Path]) -> Iterator[Case]:
-    """The piece as it is, twice, and six times degraded."""
+    """Yield the undisturbed section with and without depth, and six degraded ones."""
     rng = np.random.default_rng(seed)
     clip = clips[seed % len(clips)]
     count, length = int(rng.integers(40, 91)), len(vg.read(clip))
@@ -109,7 +109,7 @@ def _read(piece: Piece) -> Recording:
     clip = vg.read(piece.clip)
     truth = clip.ground_truth()
     if truth is None:
-        raise SystemExit(f"`{piece.clip}` has no truth to compare with")
+        raise SystemExit(f"`clips` must have a ground truth, got {piece.clip}")
     frames = list(clip.frames(piece.first, piece.first + piece.count))
     times = np.array([frame.timestamp for frame in frames])
     seen = truth.select((truth.timestamps > times[0] - 1.0) & (truth.timestamps < times[-1] + 1.0))
@@ -139,33 +139,33 @@ def _on_camera(words: str, change: Callable[[tuple[float, ...]], tuple[float, ..
 
 
 def jpeg(rng: Rng) -> Drawn:
-    """Compressed once more."""
+    """Compress again."""
     quality = int(rng.integers(8, 96))
     return _on_images(f"{quality}", lambda image, number: compressed(image, quality))
 
 
 def gamma(rng: Rng) -> Drawn:
-    """Another tone curve."""
+    """Apply another tone curve."""
     power = float(rng.uniform(0.4, 2.5))
     return _on_images(f"{power:.1f}", lambda image, number: 255 * (image / 255.0) ** power)
 
 
 def exposure(rng: Rng) -> Drawn:
-    """Brightness that swings within 10 to 40 frames."""
+    """Change the brightness periodically, within 10 to 40 frames."""
     share, period = float(rng.uniform(0.2, 0.6)), float(rng.uniform(10, 40))
     swing = lambda number: 1 + share * np.sin(2 * np.pi * number / period)
     return _on_images(f"{share:.1f},{period:.0f}", lambda image, number: image * swing(number))
 
 
 def flicker(rng: Rng) -> Drawn:
-    """Bands of light that wander through the picture, as under LED lamps."""
+    """Add bands of light that move through the image, as under LED lamps."""
     share, period, speed = float(rng.uniform(0.1, 0.4)), float(rng.uniform(60, 400)), float(rng.uniform(10, 90))
     banded = partial(in_bands_of_light, share=share, period=period, speed=speed)
     return _on_images(f"{share:.1f},{period:.0f},{speed:.0f}", banded)
 
 
 def vignette(rng: Rng) -> Drawn:
-    """Darker corners."""
+    """Darken the corners."""
     share = float(rng.uniform(0.3, 0.8))
 
     def change(image: Image, number: int) -> Image:
@@ -177,14 +177,14 @@ def vignette(rng: Rng) -> Drawn:
 
 
 def noise(rng: Rng) -> Drawn:
-    """Of a sensor in little light."""
+    """Add the noise of a sensor in little light."""
     sigma, seed = float(rng.uniform(4, 25)), int(rng.integers(1 << 30))
     fresh = lambda image, number: np.random.default_rng([seed, number]).normal(0, sigma, image.shape)
     return _on_images(f"{sigma:.0f}", lambda image, number: image + fresh(image, number))
 
 
 def blur(rng: Rng) -> Drawn:
-    """Bursts of motion blur along the rows."""
+    """Blur some sequences of images along the rows."""
     size, period, burst = int(rng.integers(7, 32)), int(rng.integers(8, 30)), int(rng.integers(2, 7))
     kernel = np.full((1, size), 1.0 / size)
     smeared = lambda image, number: cv2.filter2D(image, -1, kernel) if number % period < burst else image
@@ -192,13 +192,13 @@ def blur(rng: Rng) -> Drawn:
 
 
 def defocus(rng: Rng) -> Drawn:
-    """Out of focus, all of it."""
+    """Defocus all images."""
     sigma = float(rng.uniform(0.8, 3.0))
     return _on_images(f"{sigma:.1f}", lambda image, number: cv2.GaussianBlur(image, (0, 0), sigma))
 
 
 def cast(rng: Rng) -> Drawn:
-    """A colour cast that drifts, as of a white balance."""
+    """Add a colour cast that drifts, as of a white balance."""
     gains = rng.uniform(0.7, 1.3, (2, 3))
     share = lambda number: min(number / 40.0, 1.0)
     between = lambda number: gains[0] * (1 - share(number)) + gains[1] * share(number)
@@ -206,13 +206,13 @@ def cast(rng: Rng) -> Drawn:
 
 
 def contrast(rng: Rng) -> Drawn:
-    """Little contrast."""
+    """Reduce the contrast."""
     share = float(rng.uniform(0.08, 0.5))
     return _on_images(f"{share:.2f}", lambda image, number: 128 + (image - 128.0) * share)
 
 
 def logo(rng: Rng) -> Drawn:
-    """A mark in a corner."""
+    """Put a mark in a corner."""
     left, top = bool(rng.integers(2)), bool(rng.integers(2))
 
     def change(image: Image, number: int) -> Image:
@@ -226,14 +226,14 @@ def logo(rng: Rng) -> Drawn:
 
 
 def blink(rng: Rng) -> Drawn:
-    """Single frames that are black, or white."""
+    """Make single images black or white."""
     period, level = int(rng.integers(7, 20)), int(rng.choice([0, 255]))
     gone = lambda image, number: np.full_like(image, level) if number % period == period - 1 else image
     return _on_images(f"{period},{level}", gone)
 
 
 def drop(rng: Rng) -> Drawn:
-    """Some frames are missing."""
+    """Leave out some frames."""
     share, seed = float(rng.uniform(0.1, 0.5)), int(rng.integers(1 << 30))
 
     def change(recording: Recording) -> Recording:
@@ -244,7 +244,7 @@ def drop(rng: Rng) -> Drawn:
 
 
 def backwards(rng: Rng) -> Drawn:
-    """The last frame first."""
+    """Reverse the order of the frames."""
 
     def change(recording: Recording) -> Recording:
         end = recording.frames[-1].timestamp + recording.frames[0].timestamp
@@ -256,7 +256,7 @@ def backwards(rng: Rng) -> Drawn:
 
 
 def repeats(rng: Rng) -> Drawn:
-    """Each so-manieth frame comes twice, as where one frame rate became another."""
+    """Repeat every n-th frame, as a conversion of the frame rate does."""
     period = int(rng.integers(2, 7))
 
     def change(recording: Recording) -> Recording:
@@ -274,7 +274,7 @@ def repeats(rng: Rng) -> Drawn:
 
 
 def resize(rng: Rng) -> Drawn:
-    """Other sizes, told; the sides by factors of their own where a preset of a video site did it."""
+    """Resize, with the camera changed to match; some presets of video sites scale width and height differently."""
     across = float(rng.uniform(0.25, 1.3))
     up = across if rng.random() < 0.6 else across * float(rng.uniform(0.75, 1.3))
 
@@ -290,32 +290,32 @@ def resize(rng: Rng) -> Drawn:
 
 
 def depth_noise(rng: Rng) -> Drawn:
-    """Grows with the square of depth."""
+    """Add noise that grows with the square of depth."""
     sigma, seed = float(rng.uniform(0.005, 0.03)), int(rng.integers(1 << 30))
     fresh = lambda depth, number: np.random.default_rng([seed, number]).normal(0, 1, depth.shape) * sigma * depth**2
     return _on_depths(f"{sigma:.3f}", lambda depth, number: np.maximum(depth + fresh(depth, number), 0.01))
 
 
 def depth_far(rng: Rng) -> Drawn:
-    """None beyond what the sensor reaches."""
+    """Remove depth beyond the sensor's range."""
     reach = float(rng.uniform(1.5, 4.0))
     return _on_depths(f"{reach:.1f}", lambda depth, number: np.where(depth < reach, depth, np.nan))
 
 
 def depth_near(rng: Rng) -> Drawn:
-    """None nearer than what the sensor can."""
+    """Remove depth below the sensor's range."""
     least = float(rng.uniform(0.5, 2.0))
     return _on_depths(f"{least:.1f}", lambda depth, number: np.where(depth > least, depth, np.nan))
 
 
 def depth_scale(rng: Rng) -> Drawn:
-    """A unit that is a little off."""
+    """Scale the depth, as a slightly wrong unit does."""
     factor = float(rng.uniform(0.97, 1.03))
     return _on_depths(f"{factor:.3f}", lambda depth, number: depth * factor)
 
 
 def depth_smooth(rng: Rng) -> Drawn:
-    """Smoothed over edges, as by a phone."""
+    """Smooth depth over edges, as a phone does."""
     size = int(rng.integers(5, 25))
 
     def change(depth: Image, number: int) -> Image:
@@ -327,26 +327,26 @@ def depth_smooth(rng: Rng) -> Drawn:
 
 
 def depth_aside(rng: Rng) -> Drawn:
-    """Not quite registered to the images."""
+    """Shift depth against the images, as a wrong registration does."""
     pixels = int(rng.integers(1, 7))
     return _on_depths(f"{pixels}", lambda depth, number: np.roll(depth, pixels, 1))
 
 
 def depth_seldom(rng: Rng) -> Drawn:
-    """Only every second to fifth image has depth."""
+    """Keep the depth of every second to fifth image only."""
     period = int(rng.integers(2, 6))
     empty = lambda depth, number: depth if number % period == 0 else np.full_like(depth, np.nan)
     return _on_depths(f"{period}", empty)
 
 
 def focal(rng: Rng) -> Drawn:
-    """A focal length that is a little off."""
+    """Give a slightly wrong focal length."""
     factor = float(rng.uniform(0.92, 1.08))
     return _on_camera(f"{factor:.2f}", lambda inner: (inner[0] * factor, inner[1] * factor, *inner[2:]))
 
 
 def uncalibrated(rng: Rng) -> Drawn:
-    """No calibration."""
+    """Leave out the calibration."""
     return "", lambda recording: replace(recording, camera=replace(recording.camera, known=False))
 
 
@@ -362,7 +362,7 @@ DRAWN: dict[str, Callable[[Rng], Drawn]] = {
         *(defocus, blur, gamma, exposure, flicker, vignette, cast, contrast, noise, logo, blink, jpeg),
     )
 }
-"""In the order in which they are done to a recording."""
+"""Changes, in the order in which they are applied."""
 
 
 def _options() -> argparse.Namespace:

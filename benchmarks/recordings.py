@@ -1,4 +1,4 @@
-"""Simulated recordings, and their way to the disk."""
+"""Simulate recordings and write them to disk."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ DEPTH_UNIT = 5000.0
 
 
 def record(scene: str, count: int, seed: int) -> Recording:
-    """A simulated walk at 10 frames a second."""
+    """Simulate a walk at 10 frames per second."""
     sequence = simulate(scene, count, seed, rate=10.0)
     return Recording(list(sequence.frames()), sequence.camera, sequence.ground_truth())
 
 
 def write(recording: Recording, folder: Path, truth: Path) -> None:
-    """A TUM folder without its truth, which goes into the file `truth`."""
+    """Write a TUM folder without its ground truth, which goes into the file `truth`."""
     for part in ("rgb", "depth"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     lines: dict[str, list[str]] = {"rgb": [], "depth": []}

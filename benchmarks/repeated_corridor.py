@@ -1,7 +1,7 @@
-"""A straight corridor of equal sections, so that a place looks like the same place of every other section.
+"""Build a straight corridor of equal sections, in which all sections look the same.
 
-Both long walls have the same posters in each section, floor, ceiling and lamps repeat with it, and nothing but the two
-end walls differs. Not one of `WORLDS`: it is built to mislead loop closure.
+Both long walls have the same posters in each section, floor, ceiling and lamps repeat with it, and only the two end
+walls differ. It is built to mislead loop closure, and so is not one of `WORLDS`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from vggtgeo.simulation.trajectories import HandheldMotion, Walk
 SECTION, _WIDTH, _HEIGHT = 2.0, 2.4, 2.5
 """Metres."""
 _POSTERS = (0.40, 1.05, 1.65)
-"""Metres along a section, three on each side."""
+"""Places of the posters along a section, metres, three on each side."""
 _EYE = 1.4
 _PLAIN = Look("plaster", SECTION, detail=0.0)
 _RATE, _SPEED = 6.0, 0.4

@@ -1,12 +1,12 @@
-"""Repeated structure: a corridor of equal sections, where every false loop agrees with the next.
+"""Count false loops in a corridor of equal sections, where every false loop agrees with the next.
 
     .venv/bin/python benchmarks/repeated_structure.py [--seeds 0 1 2] [--sections 6]
 
-The corridor is that of `benchmarks/repeated_corridor.py`: sections of 2 m with the same posters. It is walked
-once from end to end, and once there and back, so that only the last frames see the first ones' wall again. A row a
-walk: the ATE after the best SE(3) before the last adjustment (odometry) and after it, how many pairs of keyframes a
-window or more apart were taken as loops, how many of them are false (they join keyframes that stand three quarters of a
-section apart or more), and the verdict.
+The corridor is that of `benchmarks/repeated_corridor.py`: sections of 2 m with the same posters. It is walked once from
+end to end, and once there and back, so that only the last frames see the first ones' wall again. The table has a row
+for each walk: the ATE after the best SE(3) before the last adjustment (odometry) and after it, how many pairs of
+keyframes a window or more apart were accepted as loops, how many of them are false (they join keyframes that are three
+quarters of a section apart or more), and the verdict.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def _row(seed: int, returns: bool, sections: int) -> str:
 
 
 def _loops(slam: Slam, sequence: SyntheticSequence, apart: int) -> tuple[int, int]:
-    """Loops that were taken, and those that join places of different sections."""
+    """Return the accepted loops, and those that join places of different sections."""
     edges = loop_edges(slam.map, apart)
     places = np.array([rigid.centre(sequence.pose(keyframe.frame)) for keyframe in slam.keyframes])
     far = [np.linalg.norm(places[first] - places[second]) > 0.75 * SECTION for first, second in edges]

@@ -1,14 +1,14 @@
-"""Which kernel, which second-order correction: pose errors with 0 to 40 % of false matches, simulated.
+"""Compare robust kernels and second-order corrections: pose errors with 0 to 40 % of false matches, simulated.
 
     .venv/bin/python benchmarks/robustness.py [--seeds 5] [--size small] [--tables kernels corrections lines]
         [--out runs/robustness] [--bench ../shared/bench]
 
-The problems are those of `problems.py`, with false matches of two kinds: *near* (10 to 60 px off; lines turned too) and
-*gross* (anywhere in the image). All kernels have a width of 1.5 px. Columns: median over the seeds of the RMSE of the
-camera centres in mm at the end of `solve` (at most 50 iterations), for each share of false matches; in brackets the
+The problems are those of `problems.py`, with false matches of two kinds: *near* (10 to 60 px wrong; lines turned too)
+and *gross* (anywhere in the image). All kernels have a width of 1.5 px. Columns: median over the seeds of the RMSE of
+the camera centres in mm at the end of `solve` (at most 50 iterations), for each share of false matches; in brackets the
 worst seed and the mean number of iterations. Rows marked *graduated* go through wider kernels first. The second table
 compares, on Huber and Cauchy, plain reweighting, the whole correction of Triggs (0.95 of it), and the adaptive part of
-it that is the default. The third compares lines of one inverse depth a sample with lines of two ends.
+it that is the default. The third compares lines with one inverse depth per sample with lines of two ends.
 """
 
 from __future__ import annotations
@@ -99,10 +99,10 @@ def _options() -> argparse.Namespace:
 
 
 def _problems(options: argparse.Namespace, two_ends: bool = False) -> Problems:
-    """`(problem, initial, true poses)` of each seed, by kind and share."""
+    """Yield `(problem, initial, true poses)` of each seed, by kind and share."""
     spec = importlib.util.spec_from_file_location("problems", options.bench / "problems.py")
     if spec is None or spec.loader is None or not (options.bench / "problems.py").is_file():
-        raise SystemExit(f"`--bench` {options.bench} holds no problems.py")
+        raise SystemExit(f"`--bench` must be a folder with problems.py, got {options.bench}")
     generator = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(generator)
     folder = options.out / "problems"
@@ -122,7 +122,7 @@ def _problems(options: argparse.Namespace, two_ends: bool = False) -> Problems:
 
 
 def _segments(arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """Segment of each landmark: after the points come line samples, by keyframe, segment and sample."""
+    """Return the segment of each landmark: after the points come line samples, by keyframe, segment and sample."""
     keyframes, points, segments, samples = arrays["sizes"]
     number = np.repeat(np.arange(keyframes * segments), samples)
     return np.concatenate([np.full(keyframes * points, -1), number])
@@ -149,7 +149,9 @@ def _row(label: str, problems: Problems, kernel: Any, solver: Any, graduation: A
 
 
 def _position_error(poses: np.ndarray, truth: np.ndarray) -> float:
-    """RMSE of the camera centres in mm; the first pose is held at the truth, the scale by the depth priors."""
+    """Return the RMSE of the camera centres, mm; the first pose is fixed at the true one, the scale by the depth
+    priors.
+    """
     centres = [-Rotation.from_quat(p[:, [1, 2, 3, 0]]).inv().apply(np.array(p[:, 4:])) for p in (poses, truth)]
     return 1e3 * float(np.sqrt(np.mean(np.sum((centres[0] - centres[1]) ** 2, 1))))
 

@@ -1,11 +1,11 @@
-"""What a rolling shutter costs, with what is done about it and without, and what readout is found.
+"""Measure the error that a rolling shutter causes, with and without its estimation, and the estimated readout time.
 
     D=../shared/data
     .venv/bin/python benchmarks/rolling_shutter.py $D/building-walk $D/corridor-office $D/redkitchen
 
-The first 40 frames of each clip, with depth and without: as they are, and with each row drawn from where the camera was
-at its moment, over 10, 20 and 30 ms more than the camera's own readout (by the clip's depth and truth). ATE in cm after
-SE(3) with depth, after Sim(3) without. Oracle: what was added.
+The first 40 frames of each clip, with depth and without: unchanged, and with each row rendered from where the camera
+was at its time, over 10, 20 and 30 ms more than the camera's own readout (by the clip's depth and ground truth). ATE in
+cm after SE(3) with depth, after Sim(3) without. Oracle: the added readout time.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ COLUMNS = ("cm, without", "cm", "verdict", "found, ms", "shift, px", "reasons")
 
 
 def cells(sequence: SequenceView) -> Iterator[str]:
-    """The error without the search and with it, and what was found."""
+    """Return the error without and with the estimation, and the estimated readout time."""
     never = vg.SlamSettings(refinement=vg.settings.GlobalMapSettings(rolling_shutter=False))
     yield f"{100 * judged(sequence, never)[1]:.1f}"
     result, error = judged(sequence)

@@ -1,13 +1,13 @@
-"""Cost of global bundle adjustment against its size: time an iteration and memory from 50 to 1600 keyframes.
+"""Measure global bundle adjustment against its size: time per iteration and memory from 50 to 1600 keyframes.
 
     taskset -c 1 .venv/bin/python benchmarks/scale.py [--generator ../shared/bench/problems.py] [--out runs/scale]
         [--keyframes 50 100 200 400 800 1600] [--dense-up-to 200] [--iterations 10] [--ceres BINARY] [--table FILE]
 
-The problems are those of the generator's size `global` (128 points and 8 lines of 8 samples a keyframe, edges to the 4
-keyframes before and after), made once and kept in the output folder. Each row is a process of its own, in float64:
-a whole jitted `solve` of so many iterations, run four times. Wall time is the median of the last three, processor time
-their least (the one to read where the core is shared). With `--ceres`, Ceres solves the same files (SPARSE_SCHUR,
-analytic, cached edges, one thread); inverse depths may become negative here, as they may there. Prints Markdown, and
+The problems are those of the generator's size `global` (128 points and 8 lines of 8 samples per keyframe, edges to the
+4 keyframes before and after), made once and kept in the output folder. Each row is measured in a separate process, in
+float64: a whole jitted `solve` of `--iterations` iterations, run four times. Wall time is the median of the last three,
+processor time their least (the one to read where the core is shared). With `--ceres`, Ceres solves the same files
+(SPARSE_SCHUR, analytic, cached edges, one thread); inverse depths may become negative in both. Prints Markdown, and
 writes it to `scale.md` and the plot to `scale.png` beside the problems.
 """
 
@@ -34,7 +34,7 @@ LABELS = {
     "ceres": "Ceres SPARSE_SCHUR",
 }
 HEADER = (
-    "| keyframes | edges | solver | ms an iteration | processor ms | us an edge | energy | compile s | memory GB |\n"
+    "| keyframes | edges | solver | ms per iteration | processor ms | us per edge | energy | compile s | memory GB |\n"
     "|---|---|---|---|---|---|---|---|---|"
 )
 
@@ -63,7 +63,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--solvers", nargs="+", choices=SOLVERS, default=SOLVERS)
     parser.add_argument("--dense-up-to", type=int, default=200, help="keyframes")
     parser.add_argument("--iterations", type=int, default=10)
-    parser.add_argument("--ceres", type=Path, help="binary of the generator's peer")
+    parser.add_argument("--ceres", type=Path, help="binary of the generator's Ceres solver")
     parser.add_argument("--table", type=Path, help="a scale.json to print and draw again instead of measuring")
     parser.add_argument("--row", nargs=2, metavar=("PROBLEM", "SOLVER"), help=argparse.SUPPRESS)
     return parser.parse_args()
@@ -85,12 +85,12 @@ def _all_rows(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def _problem(generator: Path, folder: Path, keyframes: int) -> Path:
-    """The problem of so many keyframes, made unless it is there."""
+    """Return the file of the problem with `keyframes` keyframes; make it if it does not exist."""
     path = folder / f"sequence-{keyframes}.npz"
     if not path.exists():
         spec = importlib.util.spec_from_file_location("problems", generator)
         if spec is None or spec.loader is None or not generator.is_file():
-            raise SystemExit(f"`--generator` {generator} is no Python file; give the path of problems.py")
+            raise SystemExit(f"`--generator` must be the path of problems.py, got {generator}")
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
         module.SIZES["sequence"] = {**module.SIZES["global"], "N": keyframes}
@@ -101,7 +101,7 @@ def _problem(generator: Path, folder: Path, keyframes: int) -> Path:
 
 
 def _measure(path: Path, name: str, iterations: int) -> dict[str, Any]:
-    """One row: compile, then run four times."""
+    """Measure one row: compile, then run four times."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -169,7 +169,7 @@ def _markdown(row: dict[str, Any]) -> str:
 
 
 def _draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Time an iteration against edges, both logarithmic, with a line of slope 1."""
+    """Draw the time per iteration against edges, both logarithmic, with a line of slope 1."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -183,7 +183,7 @@ def _draw(rows: list[dict[str, Any]], path: Path) -> None:
     first = min((row["edges"], row["processor_ms"]) for row in rows)
     last = max(row["edges"] for row in rows)
     axes.loglog([first[0], last], [first[1], first[1] * last / first[0]], "k:", linewidth=1, label="linear in edges")
-    axes.set(xlabel="edges", ylabel="ms an iteration (processor time)", title="Global bundle adjustment, one core")
+    axes.set(xlabel="edges", ylabel="ms per iteration (processor time)", title="Global bundle adjustment, one core")
     axes.legend()
     figure.savefig(path, dpi=150)
     pyplot.close(figure)

@@ -1,10 +1,10 @@
-"""Does the result depend on the seed? The same piece of a clip with ten seeds of the samples of robust estimators.
+"""Run the same section of a clip with ten seeds of the robust estimators, and compare the errors.
 
     python benchmarks/seeds.py ../shared/data/redkitchen ../shared/data/building-walk --frames 60
     python benchmarks/seeds.py ../shared/data/corridor-office --frames 133 --rgb-only
 
-A row a clip: the smallest, median and largest ATE, and their spread, (largest - smallest) / median. The bar is 15 %
-with depth. ATE after SE(3), without depth after Sim(3).
+The table has a row for each clip: the smallest, median and largest ATE, and their spread, (largest - smallest) /
+median. With depth the spread should be below 15 %. ATE after SE(3), without depth after Sim(3).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def main() -> None:
 
 
 def _error(piece: Piece, seed: int) -> float:
-    """ATE, cm: after SE(3), without depth after Sim(3)."""
+    """Return the ATE, cm: after SE(3), without depth after Sim(3)."""
     slam = finish(piece.run(seed), piece.roles, SETTINGS)
     errors = evaluate_trajectory(frame_trajectory(slam), piece.truth)
     return 100 * float((errors.se3 if piece.roles.metric else errors.sim3).statistics.rmse)

@@ -1,4 +1,4 @@
-"""A piece of a clip, run in this process: what the benchmarks of the map share."""
+"""Run a section of a clip in this process: shared by the benchmarks of the map."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SETTINGS = SlamSettings()
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Frames of a clip, their camera, the roles for them, and the true pose of each, camera -> world."""
+    """A section of a clip, its camera, the roles for it, and the true pose of each frame, camera -> world."""
 
     name: str
     frames: list[Frame]
@@ -32,7 +32,7 @@ class Piece:
 
     @classmethod
     def of(cls, path: Path, count: int, depth: bool = True) -> Piece:
-        """The first `count` frames, with the true pose nearest in time to each. depth: use measured depth."""
+        """Read the first `count` frames, with the true pose nearest in time to each. depth: use measured depth."""
         jax.config.update("jax_enable_x64", True)
         sequence = open_sequence(path)
         frames = [frame if depth else replace(frame, depth=None) for frame in sequence.frames(0, count, 1)]
@@ -43,6 +43,6 @@ class Piece:
         return cls(path.name, frames, sequence.camera, roles, Trajectory(times, truth.poses[rows]))
 
     def run(self, seed: int = 0) -> Slam:
-        """The state after the last frame, before the last adjustment."""
+        """Return the state after the last frame, before the last adjustment."""
         roles = self.roles.seeded(seed)
         return list(run_frames(iter(self.frames), self.camera, roles, SETTINGS, Clock()))[-1]

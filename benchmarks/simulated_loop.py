@@ -1,8 +1,9 @@
-"""A closed loop of RGB-D keyframes without images: points, depth priors and aligned surfaces, with exact truth.
+"""Simulate a closed loop of RGB-D keyframes without images: points, depth priors and aligned surfaces, with exact
+poses.
 
-Cameras stand on a circle and look outward, at clutter, at a wall and at a floor: a round corridor whose end is its
-beginning. Each keyframe sees those before and after it, around the loop, so that the graph is a ring of any length.
-The guess drifts as odometry does: it turns a little at every step, and the loop does not close.
+Cameras on a circle look outward, at clutter, a wall and a floor: a round corridor whose end is its beginning. Each
+keyframe sees the same points as those before and after it, so that the graph is a ring of any length. The initial guess
+drifts as odometry does: it turns a little at every step, and the loop does not close.
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ from vggtgeo.bundle.terms.measured_pose import SurfaceAlignment, quadratic
 from vggtgeo.simulation.small_window import SIZE, SimulatedWindow, project_between
 
 _SPACING = 0.15
-"""Metres between keyframes."""
+"""Distance between keyframes, metres."""
 _DEPTHS = 1.5, 4.5
-"""Metres to the clutter."""
+"""Distance to the clutter, metres."""
 _WALL, _FLOOR = 3.0, 1.2
-"""Metres to the wall ahead, and to the floor below."""
+"""Distance to the wall ahead, and to the floor below, metres."""
 _SURFACE_POINTS, _SURFACE_SIGMA = 60, 0.01
-"""Points of an alignment of surfaces, and the standard deviation of one, metres."""
+"""Number of points of an alignment of surfaces, and the standard deviation of one, metres."""
 _NOISE, _START_ERROR = 0.5, 0.01
 """Standard deviations of matches, pixels, and of each starting position, metres."""
 _DEPTH_ERROR = 0.03
-"""Relative standard deviation of the depth prior, which counts with the paper's `alpha = 2`."""
+"""Relative standard deviation of the depth prior, weighted with the paper's `alpha = 2`."""
 _MARGIN = 4.0
-"""Pixels from the border within which nothing is matched."""
+"""Width of the border without matches, pixels."""
 
 
 def simulate_loop(

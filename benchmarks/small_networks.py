@@ -1,14 +1,14 @@
-"""Small trained networks against SIFT and LSD on the clips: error, worst frames, time.
+"""Compare small trained networks with SIFT and LSD on the clips: error, worst frames, time.
 
     D=../shared/data
     .venv/bin/vggtgeo models export mlsd --source mlsd_pytorch --checkpoint FILE -o runs/networks/mlsd.onnx  # and alike
     .venv/bin/python benchmarks/small_networks.py $D/corridor-office $D/building-walk $D/icl-office $D/redkitchen
         --models runs/networks [--frames 100] [--rgb-only] [--seed 1]
 
-Each row is a run with other points or lines; all else is the default. ATE RMSE and the 95th percentile of the frames'
-errors, cm, after SE(3) alignment with depth and after Sim(3) without; milliseconds a frame of tracking, mapping and
-window adjustment, and of that in networks. Mixtures whose files are not in the folder are left out, with a line. Other
-seeds tell by how much two rows must differ to mean anything.
+Each row is a run with other points or lines; everything else is the default. ATE RMSE and the 95th percentile of the
+frames' errors, cm, after SE(3) alignment with depth and after Sim(3) without; milliseconds per frame of tracking,
+mapping and window adjustment, and of the networks alone. Combinations whose files are missing in the folder are
+skipped, with a line. Other seeds show which differences between rows are significant.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ COLUMNS = ("clip", "input", "roles", "tracked", "ATE cm", "95 % cm", "ms a frame
 
 
 def main() -> None:
-    """Run and print the table as it grows."""
+    """Run, and print each row when it is ready."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", type=Path, nargs="+")
     parser.add_argument("--models", type=Path, required=True, help="folder of the networks' files")
-    parser.add_argument("--frames", type=int, help="of each clip, from its first; by default all")
+    parser.add_argument("--frames", type=int, help="number of frames of each clip; by default all")
     parser.add_argument("--rgb-only", action="store_true", help="leave the depth of the clips out")
-    parser.add_argument("--seed", type=int, default=0, help="of the samples of robust estimators")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the random samples of robust estimators")
     arguments = parser.parse_args()
     mixtures = {name: mixed for name, mixed in MIXTURES.items() if _there(name, mixed, arguments.models)}
     print(f"| {' | '.join(COLUMNS)} |\n{'|---' * len(COLUMNS)}|")
@@ -66,7 +66,7 @@ def _there(name: str, mixed: Mapping[str, str], folder: Path) -> bool:
 
 
 def run(clip: Path, mixed: Mapping[str, str], models: Path, frames: int | None, rgb_only: bool, seed: int) -> list[str]:
-    """The cells of one run behind the name of its clip: input first."""
+    """Return the cells of one run after the name of its clip: input first."""
     sequence = without_depth(vg.read(clip)) if rgb_only else vg.read(clip)
     perceived = perception("classical", default_roles(sequence.has_depth), models, mixed=mixed)
     with warnings.catch_warnings():

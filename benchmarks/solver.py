@@ -1,14 +1,14 @@
-"""Every measurement of the solver in one go: a page with the tables and the plots.
+"""Run all benchmarks of the solver, and write a page with their tables and plots.
 
     .venv/bin/python benchmarks/solver.py [--quick] [--only peers scale gradients batches robustness] [--core 0]
         [--bench ../shared/bench] [--jaxls-python PYTHON] [--out runs/solver]
 
-Runs the benchmarks beside this file one after the other, each in a process of its own: `peers.py` (time an iteration
-and energy against time, interleaved with Ceres, a hand-written C++ solver and jaxls, where they are installed),
-`scale.py` (cost against the number of keyframes, Ceres beside it), `gradients.py` (cost of a backward pass),
-`batches.py` (windows a second) and `robustness.py` (kernels and false matches). The first three are pinned to one core.
-On a machine with a GPU that JAX sees, `gradients.py` and `batches.py` run there, with batches up to 4096; the peers are
-programs for a CPU, and so is what stands beside them. Writes `solver.md` in the output folder.
+Runs these benchmarks one after the other, each in a separate process: `peers.py` (time per iteration and energy against
+time, interleaved with Ceres, a hand-written C++ solver and jaxls, where they are installed), `scale.py` (cost against
+the number of keyframes, compared with Ceres), `gradients.py` (cost of a backward pass), `batches.py` (windows per
+second) and `robustness.py` (kernels and false matches). The first three are pinned to one core. On a machine with a GPU
+that JAX sees, `gradients.py` and `batches.py` run there, with batches up to 4096; the comparisons with other solvers
+stay on the CPU. Writes `solver.md` in the output folder.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NAMES = ("peers", "scale", "gradients", "batches", "robustness")
 
 @dataclass(frozen=True)
 class Part:
-    """One benchmark: its flags in full and quick, what it draws, and whether it is held on one core of the CPU."""
+    """One benchmark: its flags in full and quick, its plots, and whether it runs on one fixed core of the CPU."""
 
     title: str
     full: tuple[str, ...]
@@ -39,7 +39,7 @@ class Part:
 
 PARTS = {
     "peers": Part(
-        "Time an iteration, and energy against time",
+        "Time per iteration, and energy against time",
         ("--rounds", "5"),
         ("--rounds", "2", "--sizes", "small", "medium"),
         "energy.png",
@@ -54,7 +54,7 @@ GPU_BATCHES = ("--batches", "1", "16", "256", "4096")
 
 
 def main() -> None:
-    """Run the parts and write the page; a part that fails is named at the end and costs only itself."""
+    """Run the parts and write the page; a part that fails is listed at the end, and the others still run."""
     options = _options()
     options.out.mkdir(parents=True, exist_ok=True)
     gpu = _gpu()
@@ -73,7 +73,7 @@ def main() -> None:
         (options.out / "solver.md").write_text("\n".join(page))
     print(f"\n{options.out / 'solver.md'}")
     if failed:
-        raise SystemExit(f"these ended with an error, which is above: {', '.join(failed)}")
+        raise SystemExit(f"{', '.join(failed)} failed; the errors are above")
 
 
 def _options() -> argparse.Namespace:
@@ -81,7 +81,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--bench", type=Path, default=HERE.parents[1] / "shared" / "bench")
     parser.add_argument("--only", nargs="+", choices=NAMES, default=list(NAMES))
     parser.add_argument("--quick", action="store_true", help="fewer sizes, rounds and seeds")
-    parser.add_argument("--core", type=int, default=0, help="the core of what is pinned")
+    parser.add_argument("--core", type=int, default=0, help="the core for pinned parts")
     parser.add_argument("--jaxls-python", type=Path, help="interpreter of an environment with jaxls")
     parser.add_argument("--out", type=Path, default=Path("runs/solver"))
     return parser.parse_args()
@@ -108,12 +108,12 @@ def _command(name: str, options: argparse.Namespace, gpu: str) -> list[str]:
 
 
 def _environment(name: str) -> dict[str, str]:
-    """Peers and sizes are compared on a core, whatever else there is."""
+    """Return the environment of a part; comparisons on a CPU core ignore a GPU."""
     return {**os.environ, "JAX_PLATFORMS": "cpu"} if name in ("peers", "scale") else dict(os.environ)
 
 
 def _gpu() -> str:
-    """Name of the GPU that JAX would use, or nothing; asked in a process of its own, which gives it back."""
+    """Return the name of the GPU that JAX would use, or an empty text; a separate process asks, and frees the GPU."""
     ask = "import jax; d = jax.devices()[0]; print(d.device_kind if d.platform == 'gpu' else '')"
     return subprocess.run([sys.executable, "-c", ask], stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
 

@@ -1,12 +1,12 @@
-"""Where the time of a run goes: seconds of each stage, cold (nothing compiled before) and warm.
+"""Measure the seconds of each stage of a run, cold (nothing compiled before) and warm.
 
     D=../shared/data
     .venv/bin/python benchmarks/stage_times.py $D/redkitchen $D/icl-office $D/corridor-office $D/building-walk
     .venv/bin/python benchmarks/stage_times.py demo
 
-A column a run: d with depth, r without, u without depth and calibration (`--runs d r u`). Stages are those of the warm
-run; with a star they run in a thread beside the others. "processor" counts all threads, "memory" is the peak. `--end N`
-takes the first N frames. Clips are not mapped densely, the demo is.
+The table has a column for each run: d with depth, r without, u without depth and calibration (`--runs d r u`). Stages
+are those of the warm run; those with a star run in a thread beside the others. "processor" counts all threads, "memory"
+is the peak. `--end N` takes the first N frames. Only the demo makes a dense map.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from vggtgeo.io.process import share_heaps
 COUNTS = ("frames", "keyframes")
 WHOLE = ("whole", "processor", "memory, GB")
 BESIDE = " (own thread)"
-"""Ends the name of a stage that runs beside the others."""
+"""End of the name of a stage that runs in a thread beside the others."""
 RUNS = {"d": "with depth", "r": "without depth", "u": "without depth, camera unknown"}
 
 
@@ -64,7 +64,7 @@ def _summary(clip: str, kind: str, end: int | None) -> dict[str, Any]:
 
 
 def _measured(clip: str, kind: str, cache: str, end: int | None) -> dict[str, float]:
-    """Seconds by stage of one run in a process of its own."""
+    """Return the seconds by stage of one run in a separate process."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("JAX_", "XLA_"))}
     os.environ["XDG_CACHE_HOME"] = cache
     environment |= {"XDG_CACHE_HOME": cache, **jax_environment()}
@@ -103,7 +103,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("clips", nargs="+", help="folders, or `demo`")
     parser.add_argument("--runs", nargs="+", choices=RUNS, default=["d"])
     parser.add_argument("--end", type=int)
-    parser.add_argument("--one", choices=RUNS, help="this run of one clip, in this process")
+    parser.add_argument("--one", choices=RUNS, help="measure only this run of one clip, in this process")
     return parser.parse_args()
 
 

@@ -1,22 +1,23 @@
-"""Degraded clips with the default settings: how many come out right, how many say that they do not, how many lie.
+"""Degrade clips, run them with the default settings, and count right results, reported failures and unreported wrong
+results.
 
     .venv/bin/python benchmarks/stress.py [--clips corridor-office building-walk] [--scenes office] [--frames 60]
         [--groups a b] [--variants overlay30 ...] [--jobs 1] [--timeout 240] [--out runs/stress] [--page FILE.md]
 
-Clips are degraded by `../shared/stress/make_variants.py` and are skipped where that is not there; simulated scenes by
-`vggtgeo/simulation/degradations.py`. Each run is one `vggtgeo run` in a process of its own, which cannot see the truth.
-What is done already lies in `--out` and is not run again; `--fresh` runs all.
+Clips are degraded by `../shared/stress/make_variants.py` and are skipped where that file is missing; simulated scenes
+by `vggtgeo/simulation/degradations.py`. Each run is one `vggtgeo run` in a separate process, which cannot see the
+ground truth. Results that exist in `--out` are not computed again; `--fresh` runs all.
 
-- good: ATE at most twice that of the clip undisturbed, or 4 cm; 90 % of the frames in `trajectory.txt`; called good.
-- alarm: the same, but called degraded or failed.
-- told: not so, and called degraded or failed. error: refused with a message.
-- mild: between good and wrong, and called good. SILENT: wrong (three times, or 8 cm), and called good.
-- crash, hang: as they say.
+- good: ATE at most twice that of the undisturbed clip, or 4 cm; 90 % of the frames in `trajectory.txt`; verdict good.
+- alarm: the same, but the verdict is degraded or failed.
+- told: not so, and the verdict is degraded or failed. error: refused with a message.
+- mild: between good and wrong, and the verdict is good. SILENT: wrong (three times, or 8 cm), and the verdict is good.
+- crash, hang: the program crashed, or did not end in time.
 
-The ATE is after SE(3) where lengths are called metric, or doubtful; after Sim(3) where the scale is free.
+The ATE is after SE(3) where the scale is metric, or doubtful; after Sim(3) where it is unknown.
 
-The last column of the first table counts the good of those variants in which the information for a good result is there
-(`WITHOUT_INFORMATION` has the others).
+The last column of the first table counts the good results of those variants that contain the information for a good
+result (`WITHOUT_INFORMATION` lists the others).
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
 ORDER = ("good", "alarm", "mild", "told", "SILENT", "error", "crash", "hang")
 MAX_TURN = 2.5
-"""Degrees, RMS from frame to frame, beyond which poses are wrong whatever the ATE is."""
+"""RMS rotation error from frame to frame, degrees, above which poses are wrong for any ATE."""
 
 
 WITHOUT_INFORMATION = {
@@ -64,12 +65,12 @@ WITHOUT_INFORMATION = {
         *("occluder", "occluder_slow_big", "rgb_occluder", "overlay50"),
     ),
 }
-"""Variants of which nobody could ask a good result, by the reason."""
+"""Variants for which no good result is possible, by the reason."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A degraded recording: `make` writes it into a folder and gives that and the file of its truth."""
+    """A degraded recording: `make` writes it into a folder and returns this folder and the file of the ground truth."""
 
     source: str
     name: str
@@ -78,8 +79,8 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a run. ATE in metres; given, written, tracked: frames, tracked those in `trajectory.txt`, which
-    holds one part of a map in several.
+    """The outcome of a run. ATE in metres; given, written, tracked: numbers of frames, tracked those in
+    `trajectory.txt`, which holds one part of a map with several parts.
     """
 
     source: str
@@ -98,7 +99,7 @@ class Outcome:
 
     @property
     def ate(self) -> float:
-        """The one that counts."""
+        """Return the ATE that counts."""
         return self.ate_sim3 if self.scale.startswith("free") else self.ate_se3
 
 
@@ -107,7 +108,7 @@ def main() -> None:
     options = _options()
     cases = [*_clip_cases(options), *_scene_cases(options)]
     if not cases:
-        raise SystemExit("nothing to run: there is no `../shared/stress`, and `--scenes` names no scene")
+        raise SystemExit("`--scenes` must name a scene where `../shared/stress` is missing, got none")
     options.out.mkdir(parents=True, exist_ok=True)
     done: list[Outcome] = []
     with ThreadPoolExecutor(options.jobs) as pool:
@@ -121,7 +122,7 @@ def main() -> None:
 
 
 def judge(outcome: Outcome, base: float) -> str:
-    """The word for an outcome; base: ATE of the recording undisturbed, metres."""
+    """Return the word for an outcome; base: ATE of the undisturbed recording, metres."""
     if outcome.code is None:
         return "hang"
     if outcome.code not in (0, 3):
@@ -137,7 +138,7 @@ def judge(outcome: Outcome, base: float) -> str:
 
 
 def run_case(case: Case, options: argparse.Namespace) -> Outcome:
-    """What comes of it; kept in `options.out`, and read there where it was run before."""
+    """Return the outcome of a case, which is kept in `options.out` and read there if it exists."""
     kept = options.out / f"{case.source}.{case.name}.json"
     if kept.is_file() and not options.fresh:
         return Outcome(**json.loads(kept.read_text()))
@@ -159,7 +160,7 @@ def run_case(case: Case, options: argparse.Namespace) -> Outcome:
     except subprocess.TimeoutExpired:
         code = None
     outcome = _measured(case, folder, truth, work / "run", code, time.perf_counter() - began)
-    if outcome.code not in (0, 3) and said.strip():  # an error, or a crash: its last words are all that is left of it
+    if outcome.code not in (0, 3) and said.strip():  # keep the last line of an error or a crash
         outcome = replace(outcome, reasons=(said.strip().splitlines()[-1],))
     kept.write_text(json.dumps(asdict(outcome)))
     if not options.keep:
@@ -185,7 +186,7 @@ def _measured(case: Case, folder: Path, truth: Path, run: Path, code: int | None
 
 
 def trajectory_errors(estimate: Trajectory, true: Trajectory) -> dict[str, float]:
-    """ATE after SE(3) and Sim(3), metres, and turn; empty where too few frames have a pose to be compared."""
+    """Return the ATE after SE(3) and Sim(3), metres, and the turn; empty where too few frames have a pose."""
     try:
         report = evaluate_trajectory(estimate, true)
     except InputError:
@@ -200,7 +201,7 @@ def trajectory_errors(estimate: Trajectory, true: Trajectory) -> dict[str, float
 def _clip_cases(options: argparse.Namespace) -> Iterator[Case]:
     script = SHARED / "stress" / "make_variants.py"
     if not script.is_file():
-        print("clips are skipped: `../shared/stress/make_variants.py` is not there")
+        print("clips are skipped: `../shared/stress/make_variants.py` is missing")
         return
     spec = importlib.util.spec_from_file_location("make_variants", script)
     assert spec is not None
@@ -239,12 +240,12 @@ def _base(outcomes: list[Outcome], source: str) -> float:
 
 
 def excused(base: Outcome | None) -> float:
-    """ATE of the recording undisturbed, metres; 1 cm where that itself went wrong, so that it excuses nothing."""
+    """Return the ATE of the undisturbed recording, metres; 1 cm where that run was wrong: it excuses nothing."""
     return base.ate if base is not None and base.level == "good" and base.ate < 0.1 else 0.01
 
 
 def row(outcome: Outcome, word: str) -> str:
-    """A line of the table."""
+    """Return a row of the table."""
     reasons = "; ".join(outcome.reasons)
     reasons = reasons if len(reasons) < 160 else reasons[:157] + "..."
     name = f"**{word}**" if word in ("SILENT", "crash", "hang") else word
@@ -261,7 +262,7 @@ def _page(outcomes: list[Outcome], options: argparse.Namespace) -> str:
         "",
         "Written by `" + " ".join(["benchmarks/stress.py", *sys.argv[1:]]) + "`; the words are explained there.",
         "",
-        "| source | cases | " + " | ".join(ORDER) + " | good where the information is there |",
+        "| source | cases | " + " | ".join(ORDER) + " | good where a good result is possible |",
         "|---" * (len(ORDER) + 3) + "|",
     ]
     for source in [*dict.fromkeys(outcome.source for outcome in outcomes), "all"]:
@@ -289,21 +290,19 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--start", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     add_run_options(parser, out="runs/stress", timeout=240.0, dense="auto")
-    parser.add_argument("--page", type=Path, help="file that gets the table, too")
+    parser.add_argument("--page", type=Path, help="file to which the table is also written")
     return parser.parse_args()
 
 
 def add_run_options(parser: argparse.ArgumentParser, out: str, timeout: float, dense: str) -> None:
-    """What `run_case` asks for, with these defaults."""
+    """Add the options that `run_case` reads."""
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument(
-        "--dense", default=dense, help="as of `vggtgeo run`; the verdict does not look at the dense map"
-    )
+    parser.add_argument("--dense", default=dense, help="as for `vggtgeo run`; the verdict does not use the dense map")
     parser.add_argument("--timeout", type=float, default=timeout, help="seconds a run may take")
     parser.add_argument("--program", default=str(Path(sys.executable).parent / "vggtgeo"))
     parser.add_argument("--out", type=Path, default=Path(out))
     parser.add_argument("--keep", action="store_true", help="keep recordings and runs")
-    parser.add_argument("--fresh", action="store_true", help="run again what is done")
+    parser.add_argument("--fresh", action="store_true", help="run cases again that have a result")
 
 
 if __name__ == "__main__":

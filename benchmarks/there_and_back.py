@@ -1,10 +1,10 @@
-"""A clip forwards, then the same frames backwards: is the map used again on the way back?
+"""Run a clip forwards, then the same frames backwards, and count the keyframes that the way back adds.
 
     python benchmarks/there_and_back.py ../shared/data/redkitchen --frames 100
 
-Keyframes should grow with space, not with time: on the way back few are new. `--gap N` covers the lens for N frames in
+Keyframes should grow with space, not with time: the way back should add few. `--gap N` covers the lens for N frames in
 the middle of the clip (black images without depth), `--rgb-only` leaves depth out; `--away A B` cuts frames A to B out
-of the way there, so that the camera finds itself elsewhere and begins a new submap; the way back joins it.
+of the way there, so that the camera jumps to another place and begins a new submap; the way back joins it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from vggtgeo.slam.state import Slam, submaps_by_size
 
 
 def main() -> None:
-    """Run and print keyframes, submaps and errors, of the way there and of both."""
+    """Run, and print keyframes, submaps and errors after the way there and after both."""
     options = _options()
     piece = Piece.of(options.path, options.frames, depth=not options.rgb_only)
     frames = piece.frames
@@ -51,7 +51,7 @@ def main() -> None:
     _print("there and back, before the last adjustment", slam, truth)
     slam = finish(slam, roles, SETTINGS)
     _print("at the end", slam, truth)
-    print(f"{1e3 * seconds / len(retimed):.0f} ms a frame\n" + "\n".join(slam.notes))
+    print(f"{1e3 * seconds / len(retimed):.0f} ms per frame\n" + "\n".join(slam.notes))
 
 
 def _print(name: str, slam: Slam, truth: Trajectory) -> None:

@@ -1,10 +1,11 @@
-"""Does a run depend on the number of threads? The same simulated frames with 1, 2 and 8 of them, each in a process.
+"""Run the same simulated frames with 1, 2 and 8 threads, and compare the results.
 
     .venv/bin/python benchmarks/threads.py [--frames 24] [--threads 1 2 8] [--rgb-only]
 
 The number is that of OpenMP and BLAS (`OMP_NUM_THREADS`, `OPENBLAS_NUM_THREADS`), of OpenCV (`cv2.setNumThreads`), of
-XLA (`NPROC`, which sizes its pool), and of our own pools, which ask for the cores. Printed as Markdown: seconds, and
-the largest difference of the trajectory from that of the first row, of places in mm and of rotations in degrees.
+XLA (`NPROC`, which sizes its pool), and of this package's pools, which read the number of cores. Each run is a separate
+process. The Markdown table has seconds, and the largest difference of the trajectory from that of the first row, of
+positions in mm and of rotations in degrees.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPRO
 
 
 def main() -> int:
-    """Runs with each number of threads and prints a row for it; exit code 1 where frames differ."""
+    """Run with each number of threads and print a row for it; exit code 1 where poses differ."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2, 8])
@@ -47,12 +48,12 @@ def main() -> int:
 
 
 def in_process(threads: int, frames: int, rgb_only: bool) -> dict[str, np.ndarray]:
-    """What a run with so many threads gave."""
+    """Return the result of a run with this number of threads."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "found.npz"
         command = [sys.executable, __file__, "--child", str(file), "--threads", str(threads), "--frames", str(frames)]
         number = dict.fromkeys(VARIABLES, str(threads))
-        # The compiled code of another number of threads is not taken from the cache: it may be other code.
+        # Without the compilation cache: code compiled for another number of threads may differ.
         environment = {**os.environ, **number, "JAX_ENABLE_X64": "1", "JAX_ENABLE_COMPILATION_CACHE": "0"}
         subprocess.run([*command, *(["--rgb-only"] if rgb_only else [])], env=environment, check=True)
         with np.load(file) as arrays:
@@ -60,13 +61,13 @@ def in_process(threads: int, frames: int, rgb_only: bool) -> dict[str, np.ndarra
 
 
 def child(threads: int, frames: int, rgb_only: bool, file: Path) -> None:
-    """The run, in a process whose environment has the number of threads already."""
+    """Run in a process whose environment has the number of threads already."""
     import time
 
     import cv2
 
     cv2.setNumThreads(threads)
-    os.sched_getaffinity = lambda _: set(range(threads))  # type: ignore[attr-defined] # what our own pools ask
+    os.sched_getaffinity = lambda _: set(range(threads))  # type: ignore[attr-defined] # what this package's pools read
     import vggtgeo as vg
     from vggtgeo.datasets import without_depth
 
@@ -84,9 +85,9 @@ def child(threads: int, frames: int, rgb_only: bool, file: Path) -> None:
 
 
 def differences(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """Largest distance, mm, and angle, degrees, between poses [n, 4, 4]."""
+    """Return the largest distance, mm, and angle, degrees, between poses [n, 4, 4]."""
     moved = np.linalg.norm(one[:, :3, 3] - other[:, :3, 3], axis=1)
-    # The sine, from the part of the relative rotation that is not symmetric: a cosine knows angles to 1e-8 at best.
+    # The sine, from the part of the relative rotation that is not symmetric: a cosine resolves angles to 1e-8 at best.
     relative = one[:, :3, :3].swapaxes(1, 2) @ other[:, :3, :3]
     skew = relative - relative.swapaxes(1, 2)
     sine = 0.5 * np.linalg.norm(skew[:, (2, 0, 1), (1, 2, 0)], axis=1)

@@ -1,15 +1,15 @@
-"""The bank of simulated runs that the verdict's thresholds are set on, and validated on.
+"""Make the set of simulated runs on which the verdict's thresholds are chosen, and validated.
 
     .venv/bin/python benchmarks/verdict_bank.py make [--out runs/verdict-bank] [--count 420] [--jobs 1]
     .venv/bin/python benchmarks/verdict_bank.py judge [--out runs/verdict-bank] [--saved] [--judge MODULE]
 
-`make` runs SLAM and keeps what a verdict is computed from; what is there already is not run again. `judge` computes the
-verdict of each run again, in a second or so, and prints how many wrong results it reports (recall) and how many right
-ones it doubts (alarms), each with its Wilson interval of 95 %.
+`make` runs SLAM and keeps the inputs of the verdict; runs that exist are not made again. `judge` computes the verdict
+of each run again, in a second or so, and prints how many wrong results it reports (recall) and how many right ones it
+doubts (alarms), each with its Wilson interval of 95 %.
 
-Half of the runs are healthy: they have the errors of real cameras and calibrations (`CameraErrors`) and nothing else.
-The others have one fault besides, of a random severity (`FAULTS`). The outcome is that of `benchmarks/stress.py`, by
-truth: good, mild or wrong, whatever was done. The halves "set" and "validate" share no seed.
+Half of the runs are healthy: they have only the errors of real cameras and calibrations (`CameraErrors`). The others
+also have one fault of a random severity (`FAULTS`). The outcome is that of `benchmarks/stress.py` by the ground truth:
+good, mild or wrong, independent of the fault. The halves "set" and "validate" share no seed.
 """
 
 from __future__ import annotations
@@ -53,19 +53,19 @@ from vggtgeo.slam.state import Slam
 HALVES: dict[str, int] = {"set": 1000, "validate": 5000}
 """First seed of each half; both have fewer than 1000 walks."""
 WALKS = 24
-"""Of a half: four in each of the six worlds. Runs of one walk show the same, with other errors and faults."""
+"""Walks of a half: four in each of the six worlds. Runs of one walk differ in errors and faults."""
 MAPPED_BY_IMAGES = ("office", "hall", "staircase", "building")
 """Worlds of the runs without depth. In the others such small pictures show one wall at a time, or too little to match,
-and a run that never has a map is no test of a verdict on one."""
+and a run without a map does not test a verdict on maps."""
 VERDICT = "vggtgeo.slam.verdict.judge"
 """Module of the function `judge`."""
 BASE = 0.01
-"""Metres: the ATE that excuses nothing (`stress.excused`)."""
+"""ATE of a base run that excuses nothing, metres (`stress.excused`)."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One run of the bank, which all follows from `half` and `number`."""
+    """One run of the bank; `half` and `number` determine everything about it."""
 
     half: Literal["set", "validate"]
     number: int
@@ -76,16 +76,16 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Return the name of its folder."""
         return f"{self.half}-{self.number:03d}-{self.degradation}{'-rgb' if self.rgb_only else ''}"
 
     @property
     def rng(self) -> np.random.Generator:
-        """All that is drawn for this run alone."""
+        """Return the random generator of this run."""
         return np.random.default_rng([HALVES[self.half], self.number, 43])
 
     def as_dict(self) -> dict[str, Any]:
-        """For `case.json`."""
+        """Return the content of `case.json`."""
         walk = asdict(self.walk)
         kept = {key: walk.pop(key) for key in ("world", "seed", "frames", "size")}
         own = {key: value for key, value in asdict(self).items() if key != "walk"}
@@ -93,7 +93,7 @@ class Case:
 
 
 def main() -> None:
-    """Make the bank, or judge it."""
+    """Make the bank, or compute its verdicts."""
     options = _options()
     if options.command == "make":
         make(options)
@@ -106,7 +106,7 @@ def main() -> None:
 
 # ---------------------------------------------------------------------------------------------------------- the cases
 def cases(count: int) -> list[Case]:
-    """So many runs, halves by turns, so that any first part holds a bit of everything."""
+    """Return `count` cases, alternating between the halves, so that the first ones already contain all kinds."""
     halves = [_cases_of(half) for half in HALVES]
     return [next(halves[number % 2]) for number in range(count)]
 
@@ -132,7 +132,7 @@ def _cases_of(half: str) -> Iterator[Case]:
 
 
 def record(case: Case, render: Callable[[Walk], Recording]) -> Recording:
-    """What the run of a case reads, with its truth."""
+    """Simulate what the run of a case reads, with the ground truth."""
     rng = case.rng
     errors = CameraErrors.drawn(rng)
     perfect = render(case.walk)
@@ -151,7 +151,7 @@ def record(case: Case, render: Callable[[Walk], Recording]) -> Recording:
 
 @dataclass(frozen=True)
 class RenderedWalks:
-    """Walks that are rendered once and kept in a folder."""
+    """Render walks once and keep them in a folder."""
 
     folder: Path
 
@@ -170,9 +170,9 @@ class RenderedWalks:
 
 # ------------------------------------------------------------------------------------------------------------ the runs
 def make(options: argparse.Namespace) -> None:
-    """Run what is not there."""
+    """Run the cases that have no result yet."""
     todo = [case for case in cases(options.count) if not (options.out / case.name / "outcome.json").is_file()]
-    print(f"{options.count - len(todo)} of {options.count} runs are there", flush=True)
+    print(f"{options.count - len(todo)} of {options.count} runs exist", flush=True)
     if options.jobs == 1:
         _run_all(todo, options.out)
         return
@@ -190,7 +190,7 @@ def _run_all(todo: list[Case], out: Path) -> None:
 
 
 def run(case: Case, render: Callable[[Walk], Recording], out: Path) -> str:
-    """Run a case, and keep what its verdict is computed from; its folder appears when all is in it. Returns a line."""
+    """Run a case, keep the inputs of its verdict, and return a line about it; its folder appears only when complete."""
     recording = record(case, render)
     part = out / f".{case.name}.{os.getpid()}"
     shutil.rmtree(part, ignore_errors=True)
@@ -239,7 +239,7 @@ def _facts(result: vg.Result, slam: Slam, recording: Recording) -> dict[str, Any
         "bank",
         "run",
         0,
-        level="good",  # so that the outcome is that by truth, whatever the verdict says
+        level="good",  # so that the outcome depends on the ground truth only
         scale=result.summary["scale"],
         given=len(recording.frames),
         written=result.summary["frames"],
@@ -264,7 +264,7 @@ def _facts(result: vg.Result, slam: Slam, recording: Recording) -> dict[str, Any
 
 
 def _frame_errors(slam: Slam, estimate: Trajectory, recording: Recording, with_scale: bool) -> np.ndarray:
-    """Position error of each frame after the alignment of all, metres; NaN without a pose."""
+    """Return the position error of each frame after the alignment of all, metres; NaN without a pose."""
     rows = {round(frame.timestamp, 6): row for row, frame in enumerate(recording.frames)}
     own = np.array([rows[round(float(time), 6)] for time in estimate.timestamps], int)
     errors = np.full(len(recording.frames), np.nan)
@@ -279,7 +279,7 @@ def _frame_errors(slam: Slam, estimate: Trajectory, recording: Recording, with_s
 # --------------------------------------------------------------------------------------------------------- the verdicts
 @dataclass(frozen=True)
 class Judged:
-    """A run and its verdict. outcome: by truth."""
+    """A run and its verdict. outcome: by the ground truth."""
 
     half: str
     degradation: str
@@ -293,14 +293,14 @@ class Judged:
 def judged(
     out: Path, half: str | None = None, saved: bool = False, module: str = VERDICT, verbose: bool = False
 ) -> list[Judged]:
-    """Every run that is there, with the verdict computed again, or, where `saved`, as the run gave it."""
+    """Return every run in the bank, with its verdict computed again, or, where `saved`, as the run gave it."""
     judge = in_double_precision(importlib.import_module(module).judge)
     found = []
     for folder in sorted(path.parent for path in out.glob("[!.]*/outcome.json")):
         case, outcome = (json.loads((folder / name).read_text()) for name in ("case.json", "outcome.json"))
         if outcome["outcome"] == "error" or (half and case["half"] != half):
             continue
-        # A run that never had a map is wrong, but cannot be taken for a right one: it counts for no recall.
+        # A run without a map is wrong, but nobody takes it for a right one: it does not count for the recall.
         word = outcome["outcome"] if np.isfinite(outcome["ate"]) else NO_MAP
         level, reasons = outcome["level"], outcome["reasons"]
         if not saved:
@@ -320,10 +320,10 @@ def judged(
 
 
 class _Unpickler(pickle.Unpickler):
-    """Reads banks that were made before a module was renamed."""
+    """Read banks that were made before a module was renamed."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """The class of this name where it is now."""
+        """Return the class of this name from its present module."""
         return super().find_class(MOVED.get((module, name), module), name)
 
 
@@ -336,7 +336,7 @@ MOVED = {
 
 
 def read(path: Path) -> Any:
-    """What `make` kept. Fields that are newer than a bank have their default: no deviation of a depth is known."""
+    """Read what `make` kept. Fields that a bank of an older version lacks get their default values."""
     with path.open("rb") as file:
         kept = _Unpickler(file).load()
     for keyframe in kept.keyframes if isinstance(kept, Slam) else ():
@@ -347,7 +347,7 @@ def read(path: Path) -> Any:
 
 
 def table(runs: list[Judged]) -> str:
-    """Recall of wrong results, alarms on right ones, and how many mild ones are reported, with intervals."""
+    """Return the recall of wrong results, alarms on right ones, and how many mild ones are reported, with intervals."""
     lines = [
         "| half | degradation | runs | wrong, reported | right, doubted | mild, reported | without a map, reported |",
         "|---|---|---|---|---|---|---|",
@@ -376,7 +376,7 @@ OUTCOMES = ("wrong", "good", "mild", NO_MAP)
 
 
 def share(hits: list[bool]) -> str:
-    """Hits of all, with the Wilson interval of 95 %."""
+    """Return `hits` of all as text, with the Wilson interval of 95 %."""
     if not hits:
         return "-"
     interval = binomtest(sum(hits), len(hits)).proportion_ci(method="wilson")
@@ -392,11 +392,11 @@ def _options() -> argparse.Namespace:
         command.add_argument("--out", type=Path, default=Path("runs/verdict-bank"))
     making.add_argument("--count", type=int, default=420, help="runs in both halves together")
     making.add_argument("--jobs", type=int, default=1, help="processes; each runs many cases")
-    judging.add_argument("--saved", action="store_true", help="take the verdicts that the runs gave")
+    judging.add_argument("--saved", action="store_true", help="use the verdicts that the runs gave")
     judging.add_argument("--judge", default=VERDICT, help="module with the function `judge`")
-    judging.add_argument("--half", choices=HALVES, help="this half alone")
+    judging.add_argument("--half", choices=HALVES, help="only this half")
     judging.add_argument("--verbose", action="store_true", help="print each run whose verdict is not right")
-    judging.add_argument("--page", type=Path, help="file that gets the table, too")
+    judging.add_argument("--page", type=Path, help="file to which the table is also written")
     return parser.parse_args()
 
 

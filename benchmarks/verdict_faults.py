@@ -1,4 +1,4 @@
-"""What the runs of `verdict_bank.py` have: the errors of real cameras, and one fault of a random severity."""
+"""Simulate the runs of `verdict_bank.py`: the errors of real cameras, and one fault of a random severity."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class Walk:
-    """Frames of a walk through a built-in world. start: s, on the walk. rate: frames a second. speed: m/s.
-    turning: radians a second, of a camera that turns on the spot in place of walking; 0 for walking.
+    """A section of a walk through a built-in world. start: s, on the walk. rate: frames per second. speed: m/s.
+    turning: radians per second, of a camera that only turns on the spot; 0 for walking.
     """
 
     world: str
@@ -47,7 +47,7 @@ class Walk:
 
     @classmethod
     def drawn(cls, world: str, seed: int) -> Walk:
-        """A walk whose speed, rate, start and length follow from the seed."""
+        """Draw speed, rate, start and length of a walk."""
         rng = np.random.default_rng([seed, 41])
         speed = WORLDS[world][1].speed * float(rng.uniform(0.7, 1.5))
         frames, rate, start = int(rng.integers(40, 49)), float(rng.uniform(8, 15)), float(rng.uniform(0, 60))
@@ -62,7 +62,7 @@ class _LaterMotion(HandheldMotion):
     turning: float
 
     def camera_to_world(self, time: float) -> np.ndarray:
-        """Pose at `time` seconds of the walk, camera -> world, float64 [4, 4]."""
+        """Return the pose at `time` seconds of the walk, camera -> world, float64 [4, 4]."""
         if not self.turning:
             return super().camera_to_world(self.start + time)
         pose = super().camera_to_world(self.start)
@@ -73,7 +73,7 @@ class _LaterMotion(HandheldMotion):
 
 
 def rendered(walk: Walk) -> Recording:
-    """The walk without any error: sharp images without noise, exact depth."""
+    """Render the walk without any error: sharp images without noise, exact depth."""
     build, way = WORLDS[walk.world]
     whole = HandheldMotion.along(way, walk.seed)
     motion = _LaterMotion(whole.path, whole.step, walk.speed, whole.waves, walk.start, walk.turning)
@@ -85,7 +85,7 @@ def rendered(walk: Walk) -> Recording:
 
 @dataclass(frozen=True)
 class CameraErrors:
-    """What a real camera and its calibration add to a perfect recording; every value is drawn.
+    """Errors that a real camera and its calibration add to a perfect recording; all are drawn at random.
 
     readout, exposure, depth_late, truth_late: s. k1: radial distortion that the calibration leaves. focal: given focal
     length over the true one. aside: given principal point less the true one, shares of the width. vignette: share of
@@ -110,7 +110,7 @@ class CameraErrors:
 
     @classmethod
     def drawn(cls, rng: Rng) -> CameraErrors:
-        """Errors as cameras have them that are called calibrated and synchronised."""
+        """Draw the errors of a camera that counts as calibrated and synchronised."""
         off = lambda least, most: float(rng.uniform(least, most) * rng.choice([-1, 1]))
         return cls(
             readout=float(rng.uniform(0.0, 0.025)),
@@ -130,11 +130,11 @@ class CameraErrors:
         )
 
     def of_motion(self, recording: Recording) -> Recording:
-        """What needs exact depth: shutter and clocks."""
+        """Apply the errors that need exact depth: shutter and clocks."""
         return late_depth(exposed(recording, self.readout, self.exposure), self.depth_late)
 
     def of_sensors(self, recording: Recording, rng: Rng) -> Recording:
-        """What lens, sensors, files and calibration do, last."""
+        """Apply the errors of lens, sensors, files and calibration, which come last."""
         if self.k1:
             recording = barrel(recording, rng, self.k1)
         sensor = STEREO if self.stereo else KINECT
@@ -149,7 +149,7 @@ class CameraErrors:
 # -------------------------------------------------------------------------------------------------------- the faults
 @dataclass(frozen=True)
 class Given:
-    """What a fault is made of. severity: 0 to 1. render: gives another walk without errors."""
+    """The inputs of a fault. severity: 0 to 1. render: renders another walk without errors."""
 
     recording: Recording
     walk: Walk
@@ -158,22 +158,22 @@ class Given:
     render: Callable[[Walk], Recording]
 
     def between(self, least: float, most: float) -> float:
-        """The severity on a logarithmic scale between two positive numbers."""
+        """Return the value at this severity between two positive numbers, on a logarithmic scale."""
         return float(least * (most / least) ** self.severity)
 
     @property
     def count(self) -> int:
-        """Of the frames."""
+        """Return the number of frames."""
         return len(self.recording.frames)
 
     def stretch(self, least: float, most: float) -> slice:
-        """Frames in the middle, between these shares of all by the severity, at least one."""
+        """Return frames in the middle, at least one; the severity chooses their share between two limits."""
         length = max(round(self.between(least, most) * self.count), 1)
         first = int(self.rng.integers(self.count // 5, max(self.count - length - 3, self.count // 5 + 1)))
         return slice(first, min(first + length, self.count))
 
     def sign(self) -> int:
-        """-1 or 1."""
+        """Return -1 or 1."""
         return int(self.rng.choice([-1, 1]))
 
 
@@ -181,7 +181,9 @@ Fault = Callable[[Given], Recording]
 
 
 def shown(recording: Recording, rows: np.ndarray, times: np.ndarray | None = None) -> Recording:
-    """These frames in this order, at the times of the first ones, or those given; truth is that of what is shown."""
+    """Show these frames in this order, at the times of the first ones or at the given times, with the true poses of the
+    frames shown.
+    """
     frames, truth = recording.frames, recording.truth
     times = truth.timestamps[: len(rows)] if times is None else times
     moved = [replace(frames[row], index=k, timestamp=float(times[k])) for k, row in enumerate(rows)]
@@ -189,55 +191,55 @@ def shown(recording: Recording, rows: np.ndarray, times: np.ndarray | None = Non
 
 
 def focal_length(given: Given) -> Recording:
-    """A focal length that is 3 to 40 % off."""
+    """Give a focal length that is 3 to 40 % wrong."""
     return wrong_focal(given.recording, given.rng, (1 + given.between(0.03, 0.4)) ** given.sign())
 
 
 def principal_point(given: Given) -> Recording:
-    """A principal point that is 1 to 20 % of the width aside."""
+    """Give a principal point that is wrong by 1 to 20 % of the width."""
     far, angle = given.between(0.01, 0.2) * given.walk.size[0], given.rng.uniform(0, 2 * np.pi)
     return wrong_focal(given.recording, given.rng, 1.0, (far * np.cos(angle), far * np.sin(angle)))
 
 
 def zoom(given: Given) -> Recording:
-    """A lens that zooms by 3 to 50 % while it films."""
+    """Zoom by 3 to 50 % during the recording."""
     return zooming(given.recording, given.rng, given.between(0.03, 0.5))
 
 
 def other_lens(given: Given) -> Recording:
-    """Another lens from the middle on, of 1.03 to 1.7 times the focal length."""
+    """Change the lens in the middle, to 1.03 to 1.7 times the focal length."""
     return changed_lens(given.recording, given.rng, 1 + given.between(0.03, 0.7))
 
 
 def distortion(given: Given) -> Recording:
-    """A lens that distorts, k1 of -0.02 to -0.35, and is called a pinhole."""
+    """Distort by k1 of -0.02 to -0.35, and give a calibration without distortion."""
     return barrel(given.recording, given.rng, -given.between(0.02, 0.35))
 
 
 def depth_drift(given: Given) -> Recording:
-    """The factor of depth grows by 3 to 60 %."""
+    """Let the factor of depth grow by 3 to 60 %."""
     return growing_depth(given.recording, given.rng, given.between(0.03, 0.6))
 
 
 def depth_step(given: Given) -> Recording:
-    """The factor of depth jumps in the middle, by 3 to 60 %."""
+    """Change the factor of depth in the middle, by 3 to 60 %."""
     return jumping_depth(given.recording, given.rng, (1 + given.between(0.03, 0.6)) ** given.sign())
 
 
 def depth_offset(given: Given) -> Recording:
-    """Depth with 2 to 80 cm added."""
+    """Add 2 to 80 cm to the depth."""
     offset = given.between(0.02, 0.8)
     return with_depths(given.recording, lambda depth, row: depth + offset)
 
 
 def depth_bent(given: Given) -> Recording:
-    """Depth that grows with its square too: 1 to 30 % too far at 2 m."""
+    """Add an error that grows with the square of depth: 1 to 30 % too far at 2 m."""
     bend = given.between(0.01, 0.3) / 2.0
     return with_depths(given.recording, lambda depth, row: depth * (1 + bend * depth))
 
 
 def depth_delay(given: Given) -> Recording:
-    """Depth of the frame 1 to 12 before."""
+    """Give each frame the depth of the frame 1 to 12 before it."""
     late = round(given.between(1, 12))
     frames = given.recording.frames
     moved = [replace(frame, depth=frames[max(row - late, 0)].depth) for row, frame in enumerate(frames)]
@@ -245,7 +247,7 @@ def depth_delay(given: Given) -> Recording:
 
 
 def depth_frozen(given: Given) -> Recording:
-    """Depth that stays as it is for 5 to 70 % of the frames."""
+    """Repeat one depth image for 5 to 70 % of the frames."""
     part, frames = given.stretch(0.05, 0.7), given.recording.frames
     still = frames[part.start - 1].depth
     moved = [replace(f, depth=still if part.start <= row < part.stop else f.depth) for row, f in enumerate(frames)]
@@ -253,7 +255,7 @@ def depth_frozen(given: Given) -> Recording:
 
 
 def depth_of_another_scene(given: Given) -> Recording:
-    """Depth of another world for 5 to 90 % of the frames."""
+    """Give the depth of another world for 5 to 90 % of the frames."""
     worlds = sorted(WORLDS)
     world = worlds[(worlds.index(given.walk.world) + 1) % len(worlds)]
     others, part = given.render(replace(given.walk, world=world)).frames, given.stretch(0.05, 0.9)
@@ -265,7 +267,7 @@ def depth_of_another_scene(given: Given) -> Recording:
 
 
 def overlay(given: Given) -> Recording:
-    """A patterned board that moves with the camera, over 10 to 60 % of the picture; depth may show it."""
+    """Show a patterned board that moves with the camera, over 10 to 60 % of the image; depth may contain it."""
     width, height = given.walk.size
     pattern = _pattern(given.rng, width, height)
     below = np.arange(height)[:, None] >= round((1 - given.between(0.1, 0.6)) * height)
@@ -276,7 +278,7 @@ def overlay(given: Given) -> Recording:
 
 
 def occluder(given: Given) -> Recording:
-    """A patterned thing 0.8 m away that crosses the picture again and again, as wide as 10 to 60 % of it."""
+    """Move a patterned object 0.8 m away through the image repeatedly, 10 to 60 % of it wide."""
     width, height = given.walk.size
     wide = round(given.between(0.1, 0.6) * width)
     pattern, pace = _pattern(given.rng, wide, height), float(given.rng.uniform(0.02, 0.1)) * width
@@ -300,7 +302,7 @@ def occluder(given: Given) -> Recording:
 
 
 def frozen_pictures(given: Given) -> Recording:
-    """Pictures and depth that stay as they are for 5 to 50 % of the frames, while the camera moves on."""
+    """Repeat image and depth for 5 to 50 % of the frames, while the camera moves on."""
     part, frames = given.stretch(0.05, 0.5), given.recording.frames
     still = frames[part.start - 1]
     moved = [
@@ -311,14 +313,14 @@ def frozen_pictures(given: Given) -> Recording:
 
 
 def mirrored(given: Given) -> Recording:
-    """Pictures and depth mirrored for 5 to 60 % of the frames."""
+    """Mirror image and depth for 5 to 60 % of the frames."""
     part = given.stretch(0.05, 0.6)
     flip = lambda array, row: np.ascontiguousarray(array[:, ::-1]) if part.start <= row < part.stop else array
     return with_depths(with_images(given.recording, flip), flip)
 
 
 def reversal(given: Given) -> Recording:
-    """5 to 70 % of the frames played backwards."""
+    """Play 5 to 70 % of the frames backwards."""
     rows = np.arange(given.count)
     part = given.stretch(0.05, 0.7)
     rows[part] = rows[part][::-1]
@@ -326,14 +328,14 @@ def reversal(given: Given) -> Recording:
 
 
 def jump(given: Given) -> Recording:
-    """5 to 50 % of the frames are missing in the middle; in half of the runs the times do not show it."""
+    """Leave out 5 to 50 % of the frames in the middle; in half of the runs the times do not show it."""
     rows = np.delete(np.arange(given.count), given.stretch(0.05, 0.5))
     times = given.recording.truth.timestamps[rows]
     return shown(given.recording, rows, None if given.rng.random() < 0.5 else times)
 
 
 def cut(given: Given) -> Recording:
-    """From a frame on, another place of the same world, 0.5 to 15 s of the walk away."""
+    """Continue at another place of the same world, 0.5 to 15 s of the walk away."""
     away = given.between(0.5, 15.0)
     others = given.render(replace(given.walk, start=given.walk.start + away))
     at = int(given.rng.integers(given.count // 3, 2 * given.count // 3))
@@ -349,7 +351,7 @@ def cut(given: Given) -> Recording:
 
 
 def black_frames(given: Given) -> Recording:
-    """2 to 50 % of the frames are black, in a row or anywhere; depth is missing there, too."""
+    """Make 2 to 50 % of the frames black, together or scattered, and remove their depth."""
     part = given.stretch(0.02, 0.5)
     rows = np.arange(part.start, part.stop)
     if given.rng.random() < 0.5:
@@ -359,12 +361,12 @@ def black_frames(given: Given) -> Recording:
 
 
 def rolling_shutter(given: Given) -> Recording:
-    """Rows that are read over 25 to 100 ms, but no longer than a frame lasts."""
+    """Read the rows over 25 to 100 ms, but no longer than a frame lasts."""
     return exposed(given.recording, min(given.between(0.025, 0.1), 1 / given.walk.rate))
 
 
 def turning_on_the_spot(given: Given) -> Recording:
-    """A camera that turns by 2 to 30 degrees a second and does not walk."""
+    """Turn the camera by 2 to 30 degrees per second without walking."""
     return given.render(replace(given.walk, turning=np.radians(given.between(2, 30)) * given.sign()))
 
 
@@ -383,7 +385,7 @@ OF_DEPTH: dict[str, Fault] = {
         *(depth_drift, depth_step, depth_offset, depth_bent, depth_delay, depth_frozen, depth_of_another_scene),
     )
 } | {"centimetres": _degradation("centimetres")}
-"""Faults that only depth has."""
+"""Faults of depth."""
 OF_IMAGES: dict[str, Fault] = {
     fault.__name__: fault
     for fault in (
@@ -393,8 +395,8 @@ OF_IMAGES: dict[str, Fault] = {
 } | {name: _degradation(name) for name in ("person", "dark", "dirty_lens", "covered", "shuffled")}
 """Faults of the images, or of images and depth."""
 WITHOUT_DEPTH: dict[str, Fault] = {"turning_on_the_spot": turning_on_the_spot}
-"""Faults of runs without depth alone."""
+"""Faults of runs without depth only."""
 OF_STREAM = {"depth_frozen", "frozen_pictures"}
-"""Faults that come after the sensors: what is shown again has the same noise."""
+"""Faults that are applied after the sensors' errors: repeated images have the same noise."""
 HEALTHY = "healthy"
 FAULTS: dict[str, Fault] = {HEALTHY: lambda given: given.recording, **OF_DEPTH, **OF_IMAGES, **WITHOUT_DEPTH}

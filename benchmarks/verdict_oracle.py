@@ -1,15 +1,15 @@
-"""What the verdict cannot see: whether the true fault explains the corner tracks better than the run does.
+"""Measure what the verdict cannot detect: whether the true fault explains the corner tracks better than the run does.
 
     .venv/bin/python benchmarks/verdict_oracle.py RUN... [--out runs/verdict-bank]
 
-The runs are those that `verdict_bank.py judge --verbose` prints. For each, a table has for its windows:
+The runs are those that `verdict_bank.py judge --verbose` prints. For each, a table has a row for each window:
 
-- run, corners: RMS distance of the run's places, and of those that the verdict's corners prefer, from the true ones
-  after alignment, in the worst window, cm (of its extent, %, without depth). The verdict compares the difference of
-  both with 5 cm (without depth with 6 % of the extent).
-- gain of the fault: minus twice the log likelihood ratio of an adjustment with the true parameters of the planted
-  fault, poses free, against one without any fault, with as many observations as count as one. Nothing is estimated
-  for it. Below 28 it is chance at the verdict's level, 10^-6: nothing in the corner tracks shows the fault.
+- run, corners: RMS distance of the run's positions, and of those that the verdict's corners prefer, from the true ones
+  after alignment, in the worst window, cm (without depth % of its extent). The verdict compares the difference of both
+  with 5 cm (without depth with 6 % of the extent).
+- gain of the fault: minus twice the log likelihood ratio of an adjustment with the true parameters of the simulated
+  fault, poses free, to one without any fault, with the number of observations that count as one. It needs no estimate.
+  Below 28 it is chance at the verdict's level, 10^-6: nothing in the corner tracks shows the fault.
 """
 
 from __future__ import annotations
@@ -42,23 +42,25 @@ from vggtgeo.slam.verdict.corner_adjustment import (
 from vggtgeo.slam.verdict.judge import aligned
 
 Truth = tuple[np.ndarray, np.ndarray]
-"""Weights of the knots, [m, KNOTS], in place of those linear in time, and `theta`."""
+"""Weights of the knots, [m, KNOTS], instead of those linear in time, and `theta`."""
 
 
 @dataclass(frozen=True, eq=False)
 class WithTruth(Tracks):
-    """Tracks whose knots are any function of the observation: so a fault of any shape is a known `theta`."""
+    """Corner tracks with a known fault: its weights may be any function of the observation."""
 
     shares: np.ndarray
 
     @property
     def knots(self) -> np.ndarray:  # type: ignore[override]
-        """The given weights."""
+        """Return the given weights."""
         return self.shares
 
 
 def truth_of(case: dict[str, Any], tracks: Tracks, numbers: np.ndarray) -> Truth | None:
-    """What the fault did to these corners; None of a fault without parameters. numbers: of the window's frames."""
+    """Return the true effect of the fault on these corners; None for a fault without parameters. numbers: of the
+    window's frames.
+    """
     between = lambda least, most: least * (most / least) ** case["severity"]
     shares, theta, frame = np.zeros((len(tracks.frame), KNOTS)), np.zeros(SIZE), numbers[tracks.frame]
     name, count, depth = case["degradation"], case["given_frames"], np.nan_to_num(tracks.depth)
@@ -84,7 +86,7 @@ def truth_of(case: dict[str, Any], tracks: Tracks, numbers: np.ndarray) -> Truth
 
 @dataclass(frozen=True)
 class Window:
-    """Of one window: true errors of the run and of the preferred motion, and gain of the fault."""
+    """True errors of the run and of the preferred motion in one window, and the gain of the fault."""
 
     run: float
     corners: float
@@ -92,7 +94,7 @@ class Window:
 
 
 def window(case: dict[str, Any], tracks: Tracks, claim: Claim, true: np.ndarray) -> Window:
-    """true: float64 [f, 4, 4], camera -> world, of its frames."""
+    """Compare one window. true: float64 [f, 4, 4], camera -> world, of its frames."""
     best = explain(tracks).best
     start = replace(START, pixel=START.pixel * max(tracks.size) / 320.0)
     free = with_own_noise(solve(tracks, start_of(tracks), start))
@@ -121,7 +123,7 @@ def _distance(poses: np.ndarray, true: np.ndarray, with_scale: bool) -> float:
 
 
 def _started(tracks: Tracks, poses: np.ndarray) -> Unknowns:
-    """At other poses: points are triangulated with them, in the chart of the claimed ones."""
+    """Triangulate the points again from other poses, in the coordinates of the claimed ones."""
     points = start_of(replace(tracks, poses=poses)).points
     local = np.column_stack([points[:, :2], np.ones(len(points))]) * np.exp(-points[:, 2:])
     anchor = tracks.frame[tracks.first]
@@ -132,7 +134,7 @@ def _started(tracks: Tracks, poses: np.ndarray) -> Unknowns:
 
 
 def row(name: str, out: Path) -> str:
-    """Of the table."""
+    """Return a row of the table."""
     case, truth = json.loads((out / name / "case.json").read_text()), np.load(out / name / "truth.npz")
     slam, evidence = (read(out / name / f"{part}.pkl") for part in ("slam", "evidence"))
     claim = Claim.of(slam)

@@ -1,13 +1,13 @@
-"""What matches that no adjustment used would add to the verdict: keyframes that the map has not linked are matched.
+"""Match keyframes that the map has not linked, and measure what these matches would add to the verdict.
 
     .venv/bin/python benchmarks/verdict_unused_matches.py [--bank runs/verdict-bank] [--pairs 60] [--verbose]
 
-Of each run of `verdict_bank.py`, up to `--pairs` pairs of keyframes without a match in the map are matched by SIFT, the
-most similar views first. RANSAC finds the pose of the second relative to the first, from the points whose depth the map
-has. A pair is sure with 30 inliers that are half of its matches, as for a relocalisation. It contradicts the run where
-the places differ by more than two standard deviations and what matters (`thresholds.py`). A run is doubted where at
-least three pairs are sure and most of them contradict it. Prints how many wrong and right runs of the bank that is, and
-how many of them the verdict called good.
+For each run of `verdict_bank.py`, up to `--pairs` pairs of keyframes without a match in the map are matched by SIFT,
+the most similar views first. RANSAC finds the pose of the second relative to the first, from the points whose depth the
+map has. A pair is reliable with 30 inliers that are half of its matches, as for a relocalisation. It contradicts the
+run where the positions differ by more than two standard deviations and by more than the thresholds (`thresholds.py`). A
+run is doubted where at least three pairs are reliable and most of them contradict it. Prints the numbers of wrong and
+right runs that are doubted, and how many of them the verdict called good.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from vggtgeo.slam.verdict.thresholds import MAX_PLACE_ERROR, MAX_PLACE_ERROR_SHA
 
 MIN_INLIERS, MIN_SHARE, MIN_PAIRS = 30, 0.5, 3
 MAX_ERROR = 2.5
-"""Pixels, of an inlier."""
+"""Largest error of an inlier, pixels."""
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bank", type=Path, default=Path("runs/verdict-bank"))
-    parser.add_argument("--pairs", type=int, default=60, help="that are matched, of each run")
-    parser.add_argument("--verbose", action="store_true", help="print each run with a sure pair")
+    parser.add_argument("--pairs", type=int, default=60, help="pairs to match in each run")
+    parser.add_argument("--verbose", action="store_true", help="print each run with a reliable pair")
     options = parser.parse_args()
     matcher, found = SiftMatcher(), []
     cv2.setRNGSeed(0)
@@ -49,7 +49,7 @@ def main() -> None:
         if options.verbose and contradict:
             share = f"{sum(contradict)} of {len(contradict)} pairs contradict it"
             print(f"{state.parent.name}: {known['outcome']}, called {known.get('level')}, {share}", flush=True)
-    print("| outcome | runs | with sure pairs | doubted | of these called good |\n|---|---|---|---|---|")
+    print("| outcome | runs | with reliable pairs | doubted | of these called good |\n|---|---|---|---|---|")
     for outcome in ("wrong", "mild", "good"):
         own = [row for row in found if row[0] == outcome]
         silent = sum(level == "good" and doubted for _, level, _, doubted in own)
@@ -57,7 +57,7 @@ def main() -> None:
 
 
 def contradictions(slam: Slam, matcher: SiftMatcher, most: int) -> list[bool]:
-    """Return of each sure pair whether it contradicts the run."""
+    """Return, for each reliable pair, whether it contradicts the run."""
     linked = {pair.key for pair in slam.map.pairs if len(pair.points.index_i)}
     centres = np.array([rigid.centre(keyframe.pose) for keyframe in slam.keyframes])
     extent = float(np.sqrt(np.mean(np.sum((centres - centres.mean(0)) ** 2, axis=1)))) if len(centres) else 0.0
@@ -82,7 +82,7 @@ def contradictions(slam: Slam, matcher: SiftMatcher, most: int) -> list[bool]:
 def _measured(
     first: Keyframe, second: Keyframe, matcher: SiftMatcher, intrinsics: np.ndarray
 ) -> tuple[np.ndarray, float] | None:
-    """Return the motion first -> second [4, 4], and the deviation of its translation; None if it is not sure."""
+    """Return the motion first -> second [4, 4] and the deviation of its translation; None if it is not reliable."""
     matches = matcher.match(first.features, second.features)
     inverse = first.points.inverse_depth[matches.index_i]
     known = np.isfinite(inverse) & (inverse > 0)

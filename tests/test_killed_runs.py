@@ -18,5 +18,5 @@ def test_killed_runs_end_with_the_same_bytes(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["kills.py", "--kills", "4", "--frames", "40"])
-    assert runpy.run_path(str(ROOT / "benchmarks/kills.py"))["main"]() == 0
+    monkeypatch.setattr(sys, "argv", ["killed_runs.py", "--kills", "4", "--frames", "40"])
+    assert runpy.run_path(str(ROOT / "benchmarks/killed_runs.py"))["main"]() == 0

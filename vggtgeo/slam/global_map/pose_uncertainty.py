@@ -32,7 +32,7 @@ from vggtgeo.solvers.schur_complement import reduced_blocks, sparse_layout
 
 DEPTH_SCALE = 0.01
 """Standard deviation of a depth camera's scale factor, which a run cannot observe: root mean square 1.1 % on clips with
-ground truth (`benchmarks/honest.py`)."""
+ground truth (`benchmarks/stated_uncertainty.py`)."""
 
 MOMENT = 0.01
 """Standard deviation of the moment of an image, seconds: rolling shutters of phones and depth cameras last up to 1/30 s
@@ -45,10 +45,10 @@ MIDDLE = 0.5
 SHARED_ERRORS = 6.0
 """Number of matches with the information of one, in a map without measured depth: each match is used in both
 directions, matches of a point share the error of its host, and all share errors of the camera model. Measured as the
-ratio of squared errors to variances (`benchmarks/honest.py --whole --rgb-only`)."""
+ratio of squared errors to variances (`benchmarks/stated_uncertainty.py --whole --rgb-only`)."""
 FREE_SCALE = 0.02
 """Standard deviation of positions from scale drift, relative to the distance from the first pose
-(`benchmarks/honest.py --whole --rgb-only`)."""
+(`benchmarks/stated_uncertainty.py --whole --rgb-only`)."""
 SPREAD = 64
 """Number of keyframes, evenly spaced, that represent the others on graphs without a band: six sparse solves each."""
 

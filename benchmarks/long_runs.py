@@ -1,10 +1,10 @@
-"""Long runs: memory and time a frame in blocks, as the camera walks round a simulated building again and again.
+"""Measure memory and time per frame of long runs, in which the camera walks round a simulated building many times.
 
-    python benchmarks/long.py --scene office --frames 2000 --size 320 240
+    python benchmarks/long_runs.py --scene office --frames 2000 --size 320 240
 
-One lap of each scene is some tens of metres, so later blocks see old places again: keyframes should grow with space,
-time a frame should stay flat, and memory should grow by what a keyframe holds. The last rows tell what that is, by
-field, and how long the loops and the last adjustment took. Rendering is not counted.
+One lap of each scene is some tens of metres, so later blocks see old places again: the number of keyframes should grow
+with the space, time per frame should stay constant, and memory should grow with the number of keyframes. The last rows
+give the memory of a keyframe by field, and the time of the loops and the last adjustment. Rendering is not counted.
 """
 
 from __future__ import annotations
@@ -29,11 +29,13 @@ from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window.sliding_window import warm_up
 
 MEGABYTE = 2**20
-HEADER = "| frames | keyframes | pairs | ms a frame | largest ms | memory MB | MB a new keyframe |\n" + "|---" * 7 + "|"
+HEADER = (
+    "| frames | keyframes | pairs | ms per frame | largest ms | memory MB | MB per new keyframe |\n" + "|---" * 7 + "|"
+)
 
 
 def main() -> None:
-    """Run, print a row a block, then what a keyframe holds and what the end costs."""
+    """Run, print a row for each block of frames, then the memory of a keyframe and the time of the end."""
     options = _options()
     jax.config.update("jax_enable_x64", True)
     sequence = simulate(options.scene, options.frames, options.seed, tuple(options.size), rate=options.rate)
@@ -56,7 +58,7 @@ def main() -> None:
 
 
 def _blocks(states: Iterator[Slam], waiting: list[float], block: int) -> Slam:
-    """The last state; a row for every `block` frames."""
+    """Return the last state; print a row for every `block` frames."""
     seconds: list[float] = []
     memory, keyframes, slam = _memory(), 0, None
     began = time.perf_counter()
@@ -76,7 +78,7 @@ def _blocks(states: Iterator[Slam], waiting: list[float], block: int) -> Slam:
 
 
 def _timed(frames: Iterator[Frame], waiting: list[float]) -> Iterator[Frame]:
-    """The frames; how long each took to render is noted, as far as the run waited for it."""
+    """Yield the frames, and note how long the run waited for the rendering of each."""
     while True:
         began = time.perf_counter()
         frame = next(frames, None)
@@ -87,7 +89,7 @@ def _timed(frames: Iterator[Frame], waiting: list[float]) -> Iterator[Frame]:
 
 
 def _held(keyframes: tuple[Keyframe, ...]) -> list[str]:
-    """Kilobytes of each field of a keyframe, the mean over all."""
+    """Return the kilobytes of each field of a keyframe, the mean over all keyframes."""
     rows = {field.name: 0.0 for field in dataclasses.fields(Keyframe)}
     for keyframe in keyframes:
         for name in rows:
@@ -96,12 +98,12 @@ def _held(keyframes: tuple[Keyframe, ...]) -> list[str]:
     return [
         "| field of a keyframe | kB |\n|---|---|",
         *(f"| {name} | {size:.0f} |" for name, size in rows.items()),
-        f"| together | {sum(rows.values()):.0f} |",
+        f"| total | {sum(rows.values()):.0f} |",
     ]
 
 
 def _bytes(value: object) -> int:
-    """Of all arrays and bytes within."""
+    """Return the bytes of all arrays inside a value."""
     if isinstance(value, np.ndarray):
         return value.nbytes
     if isinstance(value, bytes):
@@ -112,7 +114,7 @@ def _bytes(value: object) -> int:
 
 
 def _memory() -> float:
-    """What the process holds now, MB."""
+    """Return the memory of the process now, MB."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return pages * 4096 / MEGABYTE
 
@@ -123,7 +125,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--frames", type=int, default=2000)
     parser.add_argument("--block", type=int, default=200)
     parser.add_argument("--size", type=int, nargs=2, default=(320, 240), metavar=("W", "H"))
-    parser.add_argument("--rate", type=float, default=10.0, help="frames a second")
+    parser.add_argument("--rate", type=float, default=10.0, help="frames per second")
     parser.add_argument("--seed", type=int, default=0)
     return parser.parse_args()
 

@@ -1,30 +1,30 @@
-"""Are the stated uncertainties of tracking true? Errors of tracked motions on clips with truth, in standard deviations.
+"""Compare the stated uncertainties of poses with their errors on clips with ground truth.
 
-    python benchmarks/honest.py ../shared/data/icl-office ../shared/data/redkitchen --frames 100
+    python benchmarks/stated_uncertainty.py ../shared/data/icl-office ../shared/data/redkitchen --frames 100
 
 Each frame states the standard deviation of its pose relative to its keyframe in the worst direction, and each keyframe
-the full information of the motion that it was tracked by. A row a clip: the share of frames whose error is within three
-standard deviations (honest: at least 95 %), of translation and of rotation, the median error and the median statement;
-then the median squared Mahalanobis distance of the keyframes' motions (honest: 5.3, chi-square of 6 degrees of freedom)
-and by what the standard deviations would have to be multiplied for that. The truth of the real clips has errors of its
-own (`../shared/data/README.md`): that of icl-office alone is exact.
+the full information matrix of its tracked motion. The table has a row for each clip: the share of frames whose error is
+within three standard deviations (expected: at least 95 %), of translation and of rotation, the median error and the
+median stated deviation; then the median squared Mahalanobis distance of the keyframes' motions (expected: 5.3,
+chi-square of 6 degrees of freedom) and the factor of the standard deviations that would give that. The ground truth of
+the real clips has errors (`../shared/data/README.md`); only that of icl-office is exact.
 
-    python benchmarks/honest.py office room ../shared/data/icl-office --whole
+    python benchmarks/stated_uncertainty.py office room ../shared/data/icl-office --whole
 
-runs whole clips, and simulated scenes by name, to their end, and compares what `uncertainty.txt` states of every frame
-with its error: against the first pose, whose own error in the truth then counts in every frame, and after alignment of
-the whole: of places by SE(3), of rotations by the best single rotation. The last two columns are the NEES against the
-first pose, as in `vggtgeo bench`. With `--rgb-only` lengths are taken by the scale of the best Sim(3); `--start` and
-`--end` run a part of each clip.
+runs whole clips, and simulated scenes by name, and compares the deviation in `uncertainty.txt` of every frame with its
+error: relative to the first pose, whose error in the ground truth then counts in every frame, and after alignment of
+the whole path: of positions by SE(3), of rotations by the best single rotation. The last two columns are the NEES
+relative to the first pose, as in `vggtgeo bench`. With `--rgb-only` the path has the scale of the best Sim(3);
+`--start` and `--end` run a part of each clip.
 
-    python benchmarks/honest.py office room ../shared/data/icl-office --drawn 10
+    python benchmarks/stated_uncertainty.py office room ../shared/data/icl-office --drawn 10
 
-What is stated of a frame counts what no run can see: the depth camera's constant factor, the calibration, the moment of
-an image, the middle of the lens. Rendered clips have none of these errors, and are far better than stated. Here each of
-ten runs of a clip has them, drawn with the standard deviations that are stated: depth times a factor, a focal length
-that is off, all cameras turned by one angle, and the truth taken at moments beside those of the images. A row a clip:
-the NEES per number, its mean over the runs with the standard error of that mean, and the share of poses within three
-standard deviations.
+The stated deviation of a frame includes errors that no run can detect: the depth camera's constant factor, the
+calibration, the time of an image, the principal point. Rendered clips have none of these errors, so their errors are
+far smaller than stated. Here each of ten runs of a clip has them, drawn with the stated standard deviations: depth
+times a factor, a wrong focal length, all cameras turned by one angle, and true poses at times beside those of the
+images. The table has a row for each clip: the NEES per dimension, its mean over the runs with the standard error of
+that mean, and the share of poses within three standard deviations.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def _whole_row(name: str, result: vg.Result, truth: vg.Trajectory, scale: float)
 
 
 def _source(path: Path) -> Sequence:
-    """The clip, or the simulated scene of that name."""
+    """Return the clip, or the simulated scene of that name."""
     return open_sequence(path) if path.exists() else vg.simulate(path.name, 80, rate=6.0)
 
 
@@ -176,8 +176,9 @@ def _drawn_row(name: str, source: Sequence, runs: int) -> str:
 
 
 def _with_unseen_errors(recording: Recording, seed: int) -> Recording:
-    """The recording with one depth factor, one focal length, one turn of all cameras (as a principal point makes it
-    that is not where it is said to be), and a moment for each image, drawn as they are stated.
+    """Return the recording with errors that no run can detect, drawn with the stated standard deviations: one depth
+    factor, one focal length, one turn of all cameras (the effect of a wrong principal point), and a time shift for each
+    image.
     """
     rng = np.random.default_rng(seed)
     longer, wider = np.exp(rng.normal(0.0, (DEPTH_SCALE, FOCAL_SIGMA)))
@@ -196,7 +197,9 @@ def _with_unseen_errors(recording: Recording, seed: int) -> Recording:
 
 
 def _error(motion: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Tangent of a motion's error, translation first; `first` and `second` are true, world -> camera."""
+    """Return the tangent vector of a motion's error, translation first; `first` and `second` are true poses, world ->
+    camera.
+    """
     return tangent(motion @ first @ rigid.invert(second))
 
 
@@ -208,8 +211,10 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--rgb-only", action="store_true")
     parser.add_argument("--start", type=int, default=0)
     parser.add_argument("--end", type=int)
-    parser.add_argument("--truth", type=Path, help="poses to compare one clip with, TUM's layout")
-    parser.add_argument("--drawn", type=int, default=0, help="so many runs of each, with errors that no run can see")
+    parser.add_argument("--truth", type=Path, help="poses to compare one clip with (TUM format)")
+    parser.add_argument(
+        "--drawn", type=int, default=0, help="number of runs of each, with errors that no run can detect"
+    )
     options = parser.parse_args()
     if options.truth and not (options.whole and len(options.clips) == 1):
         parser.error("--truth goes with --whole and one clip")

@@ -1,12 +1,12 @@
-"""Does a change keep what the system computes? Compare runs, solves and files with those kept from before.
+"""Check that a change of the code keeps all results: compare runs, solves and files with those from before the change.
 
-    .venv/bin/python benchmarks/unchanged.py --keep runs/unchanged.npz    # before the change
-    .venv/bin/python benchmarks/unchanged.py runs/unchanged.npz           # after it: exit code 1 where anything differs
+    .venv/bin/python benchmarks/same_results.py --keep runs/before.npz    # before the change
+    .venv/bin/python benchmarks/same_results.py runs/before.npz           # after it: exit code 1 where anything differs
 
 Runs the first `--frames` frames of the four clips of `../shared/data`, with and without depth (skipped where they are
-absent), two rendered rooms, a run that stops and resumes, an export to COLMAP's files, and one window: its
-solution, gradient, covariances and marginalisation. Each number must be the same to `--tolerance` (relative to the
-largest of its array), on the machine that kept them; another machine rounds differently.
+absent), two rendered rooms, a run that stops and resumes, an export to COLMAP's files, and one window: its solution,
+gradient, covariances and marginalisation. Each number must be the same within `--tolerance` (relative to the largest of
+its array), on the machine that kept them; another machine rounds differently.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ Numbers = dict[str, np.ndarray]
 
 
 def main() -> None:
-    """Compute everything, then keep it or compare it."""
+    """Compute all results, then keep or compare them."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("kept", nargs="?", type=Path, help="numbers from before the change")
     parser.add_argument("--keep", type=Path, help="write the numbers here")
     parser.add_argument("--frames", type=int, default=60)
-    parser.add_argument("--only", default="", help="the parts whose names contain this")
+    parser.add_argument("--only", default="", help="only parts whose names contain this")
     parser.add_argument("--tolerance", type=float, default=1e-9)
     options = parser.parse_args()
     if (options.kept is None) == (options.keep is None):
@@ -106,7 +106,7 @@ def _resumed() -> Numbers:
 
 
 class _Stop(Exception):
-    """Ends a run in its middle."""
+    """Stop a run in the middle."""
 
 
 @dataclass
@@ -156,7 +156,7 @@ def _window() -> Numbers:
 
 
 def _differences(before: Numbers, now: Numbers, tolerance: float) -> Iterator[str]:
-    """A line for each array that is missing, new, of another shape, or different."""
+    """Return a line for each array that is missing, new, of another shape, or different."""
     for key in sorted(before.keys() | now.keys()):
         if key not in before or key not in now:
             yield f"{key}: only {'before' if key in before else 'now'}"

@@ -1,23 +1,23 @@
-r"""With which of several paths through one clip do its images agree best? Epipolar errors: no map, no depth, no truth.
+"""Compare several paths through one clip with its images, by epipolar errors: without map, depth or ground truth.
 
     cp -rs "$(realpath ../shared/data/redkitchen)" runs/redkitchen-lens
     echo 521.96 520.27 316.1 239.3 -0.0068 -0.0433 -0.0009 -0.0016 > runs/redkitchen-lens/calibration.txt
     .venv/bin/vggtgeo run runs/redkitchen-lens -o runs/with-lens --dense none
     .venv/bin/vggtgeo run runs/redkitchen-lens -o runs/rgb-with-lens --dense none --rgb-only
-    .venv/bin/python benchmarks/images_agree.py runs/redkitchen-lens --readout 0.028 \
+    .venv/bin/python benchmarks/epipolar_errors.py runs/redkitchen-lens --readout 0.028 \
         --towards ../shared/data/redkitchen/groundtruth-colour.txt \
         ../shared/data/redkitchen/reference-colmap.txt runs/redkitchen peer.txt runs/with-lens runs/rgb-with-lens
 
-(the lens is COLMAP's, `../shared/data/README.md`; `runs/redkitchen` is the run of `two_truths.py`, `peer.txt` what
-`../shared/bench/simple_odometry.py` writes; README's last column is the same with `--towards` the reference). SIFT of
-every fifth frame is matched between frames 10, 20 and 40 apart, and a fundamental matrix of its own says which matches
-of a pair are right, so that no path has a part in it. Then, for each path, how far matches lie from each other's
-epipolar lines (Sampson's distance, pixels), where the camera stood at the moment of each row of the image (`--readout`,
-seconds; 0 reads an image at once). One rotation between camera and body, the same for all frames, is fitted for each
-path: paths of other programs may take another principal point. A row a path: root mean square of the errors, none
-counted as more than `MOST` pixels; the median over all pairs of the median error of each; ATE to the other path after
-Sim(3), cm. Then rows for paths a tenth and more of the way from it to `--towards`, aligned to that one: if the errors
-grow, the images do not want to go there.
+The lens is COLMAP's (`../shared/data/README.md`), `runs/redkitchen` is the run of `two_truths.py`, and
+`../shared/bench/simple_odometry.py` writes `peer.txt`. SIFT features of every fifth frame are matched between frames
+10, 20 and 40 apart, and the fundamental matrix of each pair selects the inliers, so that no path influences the
+selection. For each path, the table has the distances of matches from each other's epipolar lines (Sampson's distance,
+pixels), with the camera where it was at the time of each row of the image (`--readout`, seconds; 0: all rows at the
+same time). One rotation between camera and body, the same for all frames, is fitted for each path, because other
+programs may use another principal point. Columns: RMS of the errors, each limited to `MAX_ERROR` pixels; the median
+over all pairs of the median error of each; ATE to the path of `--towards` after Sim(3), cm. More rows follow for paths
+a tenth and more of the way to that of `--towards`, after alignment: if the errors grow, the images contradict that
+path.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ from vggtgeo.geometry.camera import Camera
 from vggtgeo.geometry.trajectory import Trajectory
 
 EVERY, GAPS = 5, (10, 20, 40)
-FEATURES, RATIO, INLIER, LEAST = 2000, 0.75, 2.0, 40
-MOST = 5.0
+FEATURES, RATIO, INLIER, MIN_MATCHES = 2000, 0.75, 2.0, 40
+MAX_ERROR = 5.0
 SHARES = (0.1, 0.2, 0.3, 0.5)
-"""Of the way to the other path."""
+"""Shares of the way to the other path."""
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Of all pairs of frames in one.
+    """The matches of all pairs of frames.
 
     pair: int [m], its number. frames: int [m, 2]. points: float64 [m, 2, 2], on the plane at depth 1 of both.
     """
@@ -66,30 +66,32 @@ class FramePath:
 
     @classmethod
     def of(cls, path: Trajectory) -> FramePath:
-        """Of poses as they are."""
+        """Make a path of poses."""
         return cls(path.positions, Rotation.from_matrix(path.poses[:, :3, :3]), path.timestamps)
 
     def aligned(self, to: FramePath) -> FramePath:
-        """The same in the world of the other path."""
+        """Align to the world of the other path."""
         found = umeyama(self.centres, to.centres, with_scale=True)
         return FramePath(found.points(self.centres), Rotation.from_matrix(found.rotation) * self.rotations, self.times)
 
     def towards(self, to: FramePath, share: float) -> FramePath:
-        """A path in between; share 1 is the other one."""
+        """Interpolate between the two paths; share 1 is the other one."""
         turns = Rotation.from_rotvec(share * (self.rotations.inv() * to.rotations).as_rotvec())
         return FramePath((1 - share) * self.centres + share * to.centres, self.rotations * turns, self.times)
 
     def distance(self, to: FramePath) -> float:
-        """ATE after Sim(3), cm."""
+        """Return the ATE after Sim(3), cm."""
         apart = self.aligned(to).centres - to.centres
         return 100 * float(np.sqrt(np.mean(np.sum(apart**2, 1))))
 
     def turned(self, turn: np.ndarray) -> FramePath:
-        """With a rotation vector [3] between camera and body."""
+        """Apply a rotation vector [3] between camera and body."""
         return FramePath(self.centres, self.rotations * Rotation.from_rotvec(turn), self.times)
 
     def at_rows(self, frames: np.ndarray, delay: np.ndarray) -> tuple[np.ndarray, Rotation]:
-        """Centres and rotations so many seconds beside the moment of frames, by the neighbours of each."""
+        """Return centres and rotations `delay` seconds after the times of frames, from the motion between the
+        neighbours of each.
+        """
         last = len(self.times) - 1
         before, after = np.clip(frames - 1, 0, last), np.clip(frames + 1, 0, last)
         share = (delay / (self.times[after] - self.times[before]))[:, None]
@@ -99,7 +101,7 @@ class FramePath:
 
 
 def main() -> None:
-    """Print a row for each path, and for those between it and the other one."""
+    """Print a row for each path, and for the paths between it and the other one."""
     options = _options()
     sequence = open_sequence(options.clip)
     other, *paths = _same_moments([options.towards, *options.paths])
@@ -118,7 +120,9 @@ def main() -> None:
 def _print_row(name: str, path: FramePath, other: FramePath, matches: Matches, camera: Camera, readout: float) -> None:
     fx, fy, _, _ = camera.intrinsics
     height = camera.height / fy
-    mean = lambda turn: float(np.mean(np.minimum(_errors(path.turned(turn), matches, fx, height, readout), MOST) ** 2))
+    mean = lambda turn: float(
+        np.mean(np.minimum(_errors(path.turned(turn), matches, fx, height, readout), MAX_ERROR) ** 2)
+    )
     corners = 0.01 * np.vstack([np.zeros(3), np.eye(3)])
     best = minimize(mean, np.zeros(3), method="Nelder-Mead", options={"initial_simplex": corners, "xatol": 1e-4})
     errors = _errors(path.turned(best.x), matches, fx, height, readout)
@@ -128,7 +132,7 @@ def _print_row(name: str, path: FramePath, other: FramePath, matches: Matches, c
 
 
 def _errors(path: FramePath, matches: Matches, focal: float, height: float, readout: float) -> np.ndarray:
-    """Sampson's distances, pixels [m]. height: of the image, on the plane at depth 1."""
+    """Return Sampson's distances, pixels [m]. height: of the image, on the plane at depth 1."""
     sides = []
     for side in (0, 1):
         delay = readout * matches.points[:, side, 1] / height
@@ -145,12 +149,12 @@ def _errors(path: FramePath, matches: Matches, focal: float, height: float, read
 
 
 def _matches(sequence: Sequence) -> Matches:
-    """Matches of the pairs of frames, those of a fundamental matrix of the pair's own."""
+    """Match pairs of frames, and keep the inliers of the fundamental matrix of each pair."""
     camera, sift, matcher = sequence.camera, cv2.SIFT.create(FEATURES), cv2.BFMatcher()
     seen: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for number, frame in enumerate(sequence.frames(stride=EVERY)):
         points, descriptors = sift.detectAndCompute(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), None)
-        if len(points) >= LEAST:
+        if len(points) >= MIN_MATCHES:
             pixels = camera.undistorted(np.array([point.pt for point in points]))
             seen[EVERY * number] = pixels, np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
     fx, fy, cx, cy = camera.intrinsics
@@ -159,32 +163,36 @@ def _matches(sequence: Sequence) -> Matches:
     for number, (first, second) in enumerate(pairs):
         (before, one), (after, two) = seen[first], seen[second]
         found = [near for near, far in matcher.knnMatch(one, two, k=2) if near.distance < RATIO * far.distance]
-        if len(found) < LEAST:
+        if len(found) < MIN_MATCHES:
             continue
         both = np.stack([before[[m.queryIdx for m in found]], after[[m.trainIdx for m in found]]], 1)
         _, kept = cv2.findFundamentalMat(both[:, 0], both[:, 1], cv2.USAC_MAGSAC, INLIER, 0.9999)
         both = both[np.zeros(len(both), bool) if kept is None else kept.ravel() > 0]
-        if len(both) >= LEAST:
+        if len(both) >= MIN_MATCHES:
             plane = (both - [cx, cy]) / [fx, fy]
             rows.append((np.full(len(both), number), np.tile([first, second], (len(both), 1)), plane))
     if not rows:
-        raise SystemExit(f"{sequence.name}: no two frames {GAPS} apart share {LEAST} matches; nothing can be said")
+        raise SystemExit(
+            f"`clip` must have frames {GAPS} apart that share {MIN_MATCHES} matches, got none in {sequence.name}"
+        )
     return Matches(*(np.concatenate(part) for part in zip(*rows, strict=True)))
 
 
 def _same_moments(files: list[Path]) -> list[FramePath]:
-    """The paths of files; all must have a pose for each frame."""
+    """Read the paths; all must have a pose for each frame."""
     paths = [Trajectory.load_tum(file / "trajectory.txt" if file.is_dir() else file) for file in files]
     for file, path in zip(files, paths, strict=True):
         both, _ = associate(path, paths[0])
         if not len(both) == len(path) == len(paths[0]):
-            raise SystemExit(f"{file}: {len(path)} poses, {files[0]} has {len(paths[0])}; expected the same moments")
+            raise SystemExit(
+                f"`paths` must have the same times, got {len(path)} in {file}, {len(paths[0])} in {files[0]}"
+            )
     return [FramePath.of(path) for path in paths]
 
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("clip", type=Path, help="the images, with a calibration that holds for them")
+    parser.add_argument("clip", type=Path, help="the images, with their correct calibration")
     parser.add_argument("paths", type=Path, nargs="+", help="runs, or trajectories (TUM format), a pose for each frame")
     parser.add_argument("--towards", type=Path, required=True, help="the path that all are compared with")
     parser.add_argument("--readout", type=float, default=0.0, help="seconds between first and last row of an image")

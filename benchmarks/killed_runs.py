@@ -1,10 +1,10 @@
-"""Runs that are killed at random moments and resumed, against one that nobody disturbed: the same bytes?
+"""Kill runs at random moments, resume them, and compare the bytes of the results with those of an uninterrupted run.
 
-    .venv/bin/python benchmarks/kills.py --kills 100     # simulated; exit code 1 if any bytes differ
+    .venv/bin/python benchmarks/killed_runs.py --kills 100     # simulated; exit code 1 if any bytes differ
 
-A run is killed (SIGKILL), resumed, killed again, until it ends; then another begins, until there were so many kills. By
-turns one comes at any time after the start, so that compiling and the writing of the results are hit, and one while
-frames are tracked: after the state of a frame drawn at random was kept. All is drawn by `--seed`.
+A run is killed (SIGKILL) and resumed until it ends; then the next run begins, until the number of kills is reached. The
+kills alternate: one at any time after the start, so that compilation and the writing of results are hit, and one while
+frames are tracked, after the checkpoint of a random frame. `--seed` determines all random numbers.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from vggtgeo.simulation.sequence import write_tum_folder
 PROGRAM = "from vggtgeo.cli import main; main()"
 SMALL = ("window.size=4", "window.point_slots=96", "window.line_slots=48")
 DIFFERS = ("seconds_by_stage", "frames_per_second", "frames_per_second_whole_run", "peak_memory_gb")
-"""Of the summary: times and memory."""
+"""Entries of the summary that may differ: times and memory."""
 
 
 def main() -> int:
@@ -35,7 +35,9 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--every", type=float, default=0.0, help="seconds between two states; 0: every frame's")
+    parser.add_argument(
+        "--every", type=float, default=0.0, help="seconds between two checkpoints; 0: after every frame"
+    )
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
@@ -44,7 +46,7 @@ def main() -> int:
         began = time.monotonic()
         run([], None)
         whole, seconds = contents(), time.monotonic() - began
-        print(f"undisturbed: {seconds:.1f} s, {len(whole)} files")
+        print(f"uninterrupted: {seconds:.1f} s, {len(whole)} files")
         return killed_runs(given, whole, seconds)
 
 
@@ -64,13 +66,15 @@ def killed_runs(given: argparse.Namespace, whole: dict[str, object], seconds: fl
         off = [name for name in whole.keys() | contents().keys() if whole.get(name) != contents().get(name)]
         wrong += bool(off)
         verdict = f"OTHER: {off}" if off else "the same bytes"
-        print(f"run {runs}: {len(ends) - 1} kills, with states of {ends[:-1]} frames; {verdict}", flush=True)
-    print(f"{kills} kills of {runs} runs, {wrong} ended otherwise")
+        print(f"run {runs}: {len(ends) - 1} kills, with checkpoints after {ends[:-1]} frames; {verdict}", flush=True)
+    print(f"{kills} kills of {runs} runs, {wrong} with other results")
     return int(wrong > 0)
 
 
 def run(flags: list[str], moment: float | None) -> bool:
-    """Whether a run ended by itself; killed after so many seconds, or (if whole) when so many more frames are kept."""
+    """Start a run; return whether it ended by itself. moment: kill it after so many seconds (float) or after so many
+    more saved frames (int); None lets it end.
+    """
     settings = [word for setting in SMALL for word in ("--set", setting)]
     command = [sys.executable, "-c", PROGRAM, "run", "room", "-o", "out", "--no-global", "--quiet", *settings, *flags]
     with subprocess.Popen(command) as program:
@@ -87,14 +91,14 @@ def run(flags: list[str], moment: float | None) -> bool:
 
 
 def kept() -> int:
-    """Frames of the state that a killed run kept; 0 where there is none."""
+    """Return the number of frames in the checkpoint of a killed run; 0 where there is none."""
     path = Path("out/unfinished/checkpoint.npz")
     return int(CHECKPOINT.facts(path)["frames"]) if path.is_file() else 0
 
 
 def contents() -> dict[str, object]:
-    """The files of the run, and of the summary what is no time; not the page, which tells times, nor the lock that a
-    run leaves, free, that is killed between its last file and its end.
+    """Return the files of the run and the summary without times. Left out: the page, which shows times, and the lock
+    file that stays when a run is killed between its last file and its end.
     """
     found: dict[str, object] = {}
     for path in sorted(Path("out").rglob("*")):
