@@ -218,9 +218,9 @@ def _rank_of_image(name: str, message: Any) -> tuple[bool, bool, bool]:
 
 
 def note_choice(path: Path, chosen: Chosen, poses: str) -> None:
-    """Report what was chosen, if there was a choice. poses: the topic of the truth, "" for none."""
+    """Report what was chosen, if there was a choice. poses: the topic of the ground truth, "" for none."""
     if chosen.others:
-        depth = f", depth of `{chosen.depth}`" if chosen.depth else ", no depth"
-        truth = f", truth of `{poses}`" if poses else ""
+        depth = f", depth from `{chosen.depth}`" if chosen.depth else ", no depth"
+        truth = f", ground truth from `{poses}`" if poses else ""
         left = ", ".join(f"`{name}`" for name in chosen.others)
-        warn(f"`{path}`: images of `{chosen.colour}`{depth}{truth}; not read: {left}", NoteWarning)
+        warn(f"`{path}`: images from `{chosen.colour}`{depth}{truth}; not read: {left}", NoteWarning)

@@ -67,8 +67,7 @@ class Sequence(Protocol):
         """Return the number of frames, unreadable ones included; of a video, the container's estimate."""
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """Return the frames at positions start, start + stride, ... below end, read one by one as they are asked
-        for.
+        """Return the frames at positions start, start + stride, ... below end, each read when requested.
 
         Warns of files that cannot be read, which are skipped; raises InputError for an invalid or empty selection.
         """

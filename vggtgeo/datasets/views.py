@@ -84,7 +84,7 @@ def with_rate(sequence: Sequence, rate: float) -> Sequence:
     """Return the sequence with `rate` frames a second, replacing assumed times or those of a video.
 
     Raises:
-        InputError: `rate` is not positive, or the sequence has times of its own.
+        InputError: `rate` is not positive, or the frames of the sequence already have times.
 
     """
     check_positive("rate", rate, "frames a second")
@@ -92,7 +92,10 @@ def with_rate(sequence: Sequence, rate: float) -> Sequence:
         return replace(sequence, given_rate=rate)
     if isinstance(sequence, ImageFolder | Nerfstudio | RgbdFolders):
         return replace(sequence, files=tuple(replace(file, timestamp=file.index / rate) for file in sequence.files))
-    raise InputError(f"`{sequence.name}` has times of its own; a rate is for videos and folders of images")
+    raise InputError(
+        f"`rate` must be omitted for a sequence with recorded times, got {rate:g} for `{sequence.name}`: "
+        "it is for videos and folders of images"
+    )
 
 
 def with_depth_scale(sequence: Sequence, units_per_metre: float) -> Sequence:

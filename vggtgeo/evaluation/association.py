@@ -48,7 +48,7 @@ def associate(
         estimate_rows, truth_rows = nearest_in_time(estimate.timestamps, truth.timestamps, max_dt)
         times = estimate.timestamps[estimate_rows]
     if len(times) == 0:
-        raise InputError(f"no pose of the two trajectories matches within {max_dt:g} s: {spans(estimate, truth)}")
+        raise InputError(f"poses must match within `max_dt` {max_dt:g} s, got no match: {spans(estimate, truth)}")
     return Trajectory(times, estimate.poses[estimate_rows]), Trajectory(times, truth.poses[truth_rows])
 
 
