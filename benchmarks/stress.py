@@ -115,7 +115,7 @@ def main() -> None:
         for outcome in pool.map(lambda case: run_case(case, options), cases):
             done.append(outcome)
             print(row(outcome, judge(outcome, _base(done, outcome.source))), flush=True)
-    text = _page(done, options)
+    text = _page(done)
     (options.out / "stress.md").write_text(text)
     if options.page:
         options.page.write_text(text)
@@ -255,7 +255,7 @@ def row(outcome: Outcome, word: str) -> str:
     )
 
 
-def _page(outcomes: list[Outcome], options: argparse.Namespace) -> str:
+def _page(outcomes: list[Outcome]) -> str:
     words = [judge(outcome, _base(outcomes, outcome.source)) for outcome in outcomes]
     lines = [
         "# Degraded clips",

@@ -259,20 +259,18 @@ def _facts(result: vg.Result, slam: Slam, recording: Recording) -> dict[str, Any
         "level": result.verdict.level,
         "reasons": list(result.verdict.reasons),
         "path": float(np.linalg.norm(np.diff(recording.truth.poses[:, :3, 3], axis=0), axis=1).sum()),
-        "errors": _frame_errors(slam, estimate, recording, outcome.scale.startswith("free")),
+        "errors": _frame_errors(estimate, recording, outcome.scale.startswith("free")),
     }
 
 
-def _frame_errors(slam: Slam, estimate: Trajectory, recording: Recording, with_scale: bool) -> np.ndarray:
+def _frame_errors(estimate: Trajectory, recording: Recording, with_scale: bool) -> np.ndarray:
     """Return the position error of each frame after the alignment of all, metres; NaN without a pose."""
     rows = {round(frame.timestamp, 6): row for row, frame in enumerate(recording.frames)}
     own = np.array([rows[round(float(time), 6)] for time in estimate.timestamps], int)
     errors = np.full(len(recording.frames), np.nan)
     if len(own) > 2:
         there, true = estimate.poses[:, :3, 3], recording.truth.poses[own, :3, 3]
-        found = umeyama(there, true, with_scale)
-        moved = found.scale * there @ found.rotation.T + found.translation
-        errors[own] = np.linalg.norm(moved - true, axis=1)
+        errors[own] = np.linalg.norm(umeyama(there, true, with_scale).points(there) - true, axis=1)
     return errors
 
 
