@@ -85,7 +85,7 @@ def test_a_unit_is_printed_where_lengths_are_metres_only(tmp_path: Path) -> None
     said = {
         "free (no metric depth): lengths have no unit": "in the unit of GT, which is not the metre",
         "metric": None,
-        None: "in the unit of GT, which is not known",
+        None: "in the unit of GT, which is unknown",
     }
     for scale, words in said.items():
         (tmp_path / "run" / "summary.json").unlink(missing_ok=True)

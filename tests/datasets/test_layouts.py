@@ -178,7 +178,7 @@ def test_a_truth_in_a_unit_of_its_own_is_told(tmp_path: Path) -> None:
     for folder in (scene, phone):
         sequence = tiny.quietly_opened(folder)
         assert not sequence.truth_in_metres
-        with pytest.warns(NoteWarning, match="free scale"):
+        with pytest.warns(NoteWarning, match="unknown scale"):
             assert not open_source(sequence, None, SlamSettings()).truth_in_metres
 
 

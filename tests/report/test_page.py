@@ -114,7 +114,7 @@ def test_errors_against_a_truth_without_metres_are_no_centimetres(run: RecordedR
     assert "ATE, Sim(3) [unit of the ground truth]" in text
     assert "ATE, SE(3) [cm]" in _page(run, tmp_path, summary=metric)
     assert errors_line(own["truth"], free=False).startswith(
-        f"ATE {error:.4g} after Sim(3) alignment, in the ground truth's unit"
+        f"ATE {error:.4g} after Sim(3) alignment, in the unit of the ground truth"
     )
     assert errors_line(metric["truth"], free=False).endswith(f"SE(3), {100 * error:.2f} cm after Sim(3) alignment")
 
