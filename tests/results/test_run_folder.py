@@ -252,7 +252,7 @@ def test_depth_is_saved_where_there_is_any_with_its_unit(tmp_path: Path) -> None
     ]
     found = cv2.imread(str(tmp_path / "depth/000007.depth.png"), cv2.IMREAD_UNCHANGED)
     assert found.tolist() == [[5000, 0], [0, 2500]]
-    assert "scale of this run is free" in (tmp_path / "depth/README.txt").read_text()
+    assert "scale of this run is unknown" in (tmp_path / "depth/README.txt").read_text()
     with warns("depth"):
         write_depth(tmp_path / "none", [(7, None)])
     assert not (tmp_path / "none").exists()

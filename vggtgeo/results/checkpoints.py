@@ -149,7 +149,7 @@ def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> R
         name = min(differing, key=lambda one: len(saved.get(one, "")) + len(identity.get(one, "")))
         before, now = _excerpt(saved.get(name)), _excerpt(identity.get(name))
         raise InputError(
-            f"`{name}` must be {before} as in the run in `{asked.path}`, got {now}: use the same, or start again with "
+            f"`{name}` must be {before}, as in the run in `{asked.path}`, got {now}: use the same, or start again with "
             "`--no-resume`"
         )
     found: RunSoFar = CHECKPOINT.read(asked.path)[0]
@@ -158,7 +158,7 @@ def load_checkpoint(asked: Checkpoints | None, identity: Mapping[str, str]) -> R
 
 
 def _excerpt(value: str | None) -> str:
-    return "nothing" if value is None else value if len(value) <= _EXCERPT else f"{value[:_EXCERPT]}..."
+    return "unset" if value is None else value if len(value) <= _EXCERPT else f"{value[:_EXCERPT]}..."
 
 
 def frame_count_text(path: Path) -> str:
