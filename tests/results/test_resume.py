@@ -125,7 +125,7 @@ def test_only_the_same_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         ({"options": {"seed": 1}}, "`seed` must be 0.*got 1"),
         ({"options": {"end": 4}}, r"`start, end, stride` must be \(0, None, 1\).*got \(0, 4, 1\)"),
         ({"frames": replace(sequence(), seed=1)}, "`name` must be 'synthetic room, seed 0'.*'synthetic room, seed 1'"),
-        ({"frames": iter(sequence().frames())}, "`frames` .*cannot be resumed"),
+        ({"frames": iter(sequence().frames())}, "`resume` must be False for a stream.*`frames`"),
     ):
         with pytest.raises(InputError, match=sentence):
             run(monkeypatch, before, **given)
@@ -227,5 +227,5 @@ def test_the_command_says_what_it_does(tmp_path: Path) -> None:
     assert call("--no-resume").exit_code == 3
     begun = call("--resume")
     assert begun.exit_code == 3
-    assert f"nothing to resume in `{tmp_path / 'out'}`: the run begins at its first frame" in begun.stderr
+    assert f"`{tmp_path / 'out'}` has no checkpoint: the run starts at the first frame" in begun.stderr
     assert "resume" not in (tmp_path / "out/settings.toml").read_text()
