@@ -1,7 +1,7 @@
 """Check that a change of the code keeps all results: compare runs, solves and files with those from before the change.
 
-    .venv/bin/python benchmarks/same_results.py --keep runs/before.npz    # before the change
-    .venv/bin/python benchmarks/same_results.py runs/before.npz           # after it: exit code 1 where anything differs
+    .venv/bin/python benchmarks/unchanged.py --keep runs/before.npz    # before the change
+    .venv/bin/python benchmarks/unchanged.py runs/before.npz           # after it: exit code 1 where anything differs
 
 Runs the first `--frames` frames of the four clips of `../shared/data`, with and without depth (skipped where they are
 absent), two rendered rooms, a run that stops and resumes, an export to COLMAP's files, and one window: its solution,
