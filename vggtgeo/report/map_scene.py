@@ -149,7 +149,7 @@ def map_scene(
 
 
 def _add_cameras(
-    arrays: dict[str, np.ndarray], keyframes: Sequence[Pictured], frustums: Float[np.ndarray, "k 5 3"]
+    arrays: dict[str, np.ndarray], keyframes: Sequence[KeyframeView], frustums: Float[np.ndarray, "k 5 3"]
 ) -> None:
     """Add the cameras of the keyframes, and their images in one array with the end of each."""
     arrays["cameras"] = frustums.astype(np.float32)
@@ -158,7 +158,7 @@ def _add_cameras(
     arrays["images"] = np.frombuffer(b"".join(images), np.uint8)
 
 
-def _named(keyframes: Sequence[Pictured], uncertainty: PoseUncertainty | None) -> list[dict[str, object]]:
+def _named(keyframes: Sequence[KeyframeView], uncertainty: PoseUncertainty | None) -> list[dict[str, object]]:
     """Return what the view writes about each keyframe."""
     return [
         {
