@@ -30,10 +30,9 @@ Function = Callable[[jax.Array], jax.Array]
 
 def weighted(share: jax.Array) -> vg.Problem:
     """The problem with its points weighted otherwise, one by one."""
-    factor = share ** jnp.linspace(0.5, 2.0, PROBLEM.terms["points"].weight.size).reshape(
-        PROBLEM.terms["points"].weight.shape
-    )
-    return PROBLEM.with_term(PROBLEM.terms["points"].reweighted(factor * PROBLEM.terms["points"].weight))
+    points = PROBLEM.terms["points"]
+    factor = share ** jnp.linspace(0.5, 2.0, points.weight.size).reshape(points.weight.shape)
+    return PROBLEM.with_term(points.reweighted(factor * points.weight))
 
 
 def prior_left(share: jax.Array) -> jax.Array:

@@ -102,9 +102,8 @@ def test_a_gradient_at_a_failed_solve_is_not_finite() -> None:
     bad = ranges(CENTRES[0])
 
     def loss(distance: jax.Array) -> jax.Array:
-        term = Range(
-            keyframe=[0, 1, 2], anchor=bad.terms["range"].anchor, distance=distance, weight=bad.terms["range"].weight
-        )
+        known = bad.terms["range"]
+        term = Range(keyframe=[0, 1, 2], anchor=known.anchor, distance=distance, weight=known.weight)
         return jnp.sum(vg.solve(bad.with_term(term, replace=True), START).state.poses.translation() ** 2)
 
     assert np.isnan(jax.jit(jax.grad(loss))(bad.terms["range"].distance)).any()

@@ -119,13 +119,9 @@ def test_absent_observations_may_hold_anything() -> None:
     # Proves that NaN behind a zero weight reaches neither the value nor the gradient. Oracle: zeros there instead.
     problem, state, _ = NOISY.pack(size=PaddedSize(3, 9, 5, 3))
     nan_where = lambda values, weight: jnp.where(weight > 0, values, jnp.nan)
+    measured = ("points", "target"), ("lines", "coefficients"), ("depth", "mean"), ("depth", "sigma")
     spoilt = eqx.tree_at(
-        lambda p: (
-            p.terms["points"].target,
-            p.terms["lines"].coefficients,
-            p.terms["depth"].mean,
-            p.terms["depth"].sigma,
-        ),
+        lambda p: tuple(getattr(p.terms[name], field) for name, field in measured),
         problem,
         (
             nan_where(problem.terms["points"].target, problem.terms["points"].weight[..., None]),

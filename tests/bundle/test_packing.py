@@ -46,11 +46,8 @@ def observed(problem: Problem) -> set[tuple[float, ...]]:
     """Every point observation as (host pixel, match, weight, host, target): what there is, whatever its place."""
     edge, slot = np.nonzero(problem.terms["points"].weight > 0)
     source, target = np.asarray(problem.edges.source)[edge], np.asarray(problem.edges.target)[edge]
-    rows = [
-        problem.pixels[source, slot],
-        problem.terms["points"].target[edge, slot],
-        problem.terms["points"].weight[edge, slot][:, None],
-    ]
+    points = problem.terms["points"]
+    rows = [problem.pixels[source, slot], points.target[edge, slot], points.weight[edge, slot][:, None]]
     return {
         (*map(float, row), int(i), int(j)) for row, i, j in zip(np.concatenate(rows, 1), source, target, strict=True)
     }
@@ -235,9 +232,7 @@ def test_scattered_weights_are_those_that_pack_places(packed: Packed) -> None:
         )
 
     found = weights(*map(jnp.asarray, (seen.point_weight, seen.line_weight, seen.depth_weight)))
-    for array, term in zip(
-        found, (problem.terms["points"], problem.terms["lines"], problem.terms["depth"]), strict=True
-    ):
+    for array, term in zip(found, problem.terms.ordered[:3], strict=True):
         np.testing.assert_array_equal(array, term.weight)
     target = index.scatter_points(seen.point_target, seen, jnp.ones_like(problem.terms["points"].target))
     np.testing.assert_array_equal(target, problem.terms["points"].target)

@@ -81,9 +81,8 @@ def test_matches_are_found_again() -> None:
     # Proves that `gather_points` finds each match in an edge of its landmark's row. Oracle: the observations.
     seen = SCENE.observations
     for problem, _, index in (WHOLE, ROWS):
-        np.testing.assert_allclose(
-            index.gather_points(problem.terms["points"].target, seen), seen.point_target, rtol=1e-12
-        )
+        target = index.gather_points(problem.terms["points"].target, seen)
+        np.testing.assert_allclose(target, seen.point_target, rtol=1e-12)
         ends = np.stack([problem.edges.source, problem.edges.target], 1)
         np.testing.assert_array_equal(
             ends[index.stored_edge(seen.point_edge, seen.point_landmark)], seen.edges[seen.point_edge]

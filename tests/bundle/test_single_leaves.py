@@ -23,10 +23,7 @@ SCENE = make_scene(2, 6, 0, noise=0.5, depth_error=0.05, seed=4)
 SOLVER = SchurLevenbergMarquardt(rtol=1e-9, max_iterations=40)
 Leaf = Callable[[Problem], Any]
 
-LEAVES: dict[str, Leaf] = {
-    "alpha": lambda p: p.terms["depth"].alpha,
-    "marginal root": lambda p: p.terms["marginal"].root,
-}
+LEAVES = {"alpha": lambda p: p.terms["depth"].alpha, "marginal root": lambda p: p.terms["marginal"].root}
 """A leaf that touches landmarks only, and one of poses and camera only."""
 
 

@@ -70,9 +70,8 @@ def test_a_step_moves_everything_to_its_new_place(leaving: int) -> None:
     staying = [place for place in range(KEYFRAMES) if place != leaving]
     expected = vg.permute_prior(jax.jit(vg.marginalise)(problem, state, leaving), np.array([*staying, -1]))
     curved = lambda prior: np.asarray(prior.root.T @ prior.root)
-    np.testing.assert_allclose(
-        curved(found.terms["marginal"]), curved(expected), rtol=1e-9, atol=1e-9 * curved(expected).max()
-    )
+    prior = curved(found.terms["marginal"])
+    np.testing.assert_allclose(prior, curved(expected), rtol=1e-9, atol=1e-9 * curved(expected).max())
     np.testing.assert_array_equal(found.fixed_pose, [leaving != 0, False, False, False])
     np.testing.assert_array_equal(initial.poses.wxyz_xyz[:-1], state.poses.wxyz_xyz[np.array(staying)])
     np.testing.assert_array_equal(initial.poses.wxyz_xyz[-1], following[1].poses.wxyz_xyz[-1])

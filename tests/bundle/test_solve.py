@@ -108,14 +108,12 @@ def test_input_that_is_not_finite(solved: Solve, spoil: str) -> None:
     elif spoil == "pixel":
         problem = nan(problem, lambda p: p.pixels)
     elif spoil == "target":
-        problem = eqx.tree_at(
-            lambda p: p.terms["points"].target, problem, replace_fn=lambda leaf: leaf.at[seen].set(jnp.nan)
-        )
+        target = lambda p: p.terms["points"].target
+        problem = eqx.tree_at(target, problem, replace_fn=lambda leaf: leaf.at[seen].set(jnp.nan))
     else:
         value = {"weight": jnp.inf, "no weight": jnp.nan, "negative weight": -1.0}[spoil]
-        problem = eqx.tree_at(
-            lambda p: p.terms["points"].weight, problem, replace_fn=lambda leaf: leaf.at[seen].set(value)
-        )
+        weight = lambda p: p.terms["points"].weight
+        problem = eqx.tree_at(weight, problem, replace_fn=lambda leaf: leaf.at[seen].set(value))
     solution = solved(problem, start)
     assert solution.result == "nonfinite_input"
     assert int(solution.iterations) == 0
@@ -128,9 +126,8 @@ def test_a_step_that_is_not_finite(solved: Solve) -> None:
     # Proves that equations beyond the range of numbers end as a failure, not as convergence, with a finite state.
     problem, start, _ = NOISY.pack(**OPTIONS)
     problem = eqx.tree_at(lambda p: p.terms["depth"].mean, problem, start.inverse_depth)
-    solution = solved(
-        eqx.tree_at(lambda p: p.terms["depth"].sigma, problem, replace_fn=lambda leaf: leaf * 1e-200), start
-    )
+    sigma = lambda p: p.terms["depth"].sigma
+    solution = solved(eqx.tree_at(sigma, problem, replace_fn=lambda leaf: leaf * 1e-200), start)
     assert solution.result == "nonfinite_step"
     assert not bool(solution.converged)
     assert finite(solution)
@@ -144,9 +141,8 @@ def test_without_depth_the_scale_is_held(solved: Solve) -> None:
     solution = solved(problem, start)
     scale = float(jnp.linalg.norm(solution.state.poses.translation()) / jnp.linalg.norm(truth.poses.translation()))
     size = float(jnp.linalg.norm(start.poses.translation()) / jnp.linalg.norm(truth.poses.translation()))
-    seen = jnp.any(
-        (jnp.concatenate([problem.terms["points"].weight, problem.terms["lines"].weight], 1) > 0).reshape(3, 2, -1), 1
-    )
+    weights = jnp.concatenate([problem.terms["points"].weight, problem.terms["lines"].weight], 1)
+    seen = jnp.any((weights > 0).reshape(3, 2, -1), 1)
     rescaled = State(
         jaxlie.SE3(solution.state.poses.wxyz_xyz.at[:, 4:].divide(scale)),
         solution.state.intrinsics,

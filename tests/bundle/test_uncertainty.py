@@ -111,9 +111,8 @@ def test_a_landmark_that_only_an_undetermined_keyframe_sees(estimated: Estimate)
     whole, _ = packed(WELL, at_truth=True, **OPTIONS)
     source, target = problem.edges.source[:, None], problem.edges.target[:, None]
     at_slot = (source == 1) & (jnp.arange(lacking.POINTS) == 0)
-    weight = jnp.where(
-        at_slot & (target == 2), whole.terms["points"].weight, jnp.where(at_slot, 0.0, problem.terms["points"].weight)
-    )
+    weight = jnp.where(at_slot, 0.0, problem.terms["points"].weight)
+    weight = jnp.where(at_slot & (target == 2), whole.terms["points"].weight, weight)
     assert float(weight.sum(1)[(problem.edges.source == 1) & (problem.edges.target == 2)][0]) > 0
     only_seen_there = (weight, problem.terms["depth"].weight.at[1, 0].set(0.0))
     problem = eqx.tree_at(lambda p: (p.terms["points"].weight, p.terms["depth"].weight), problem, only_seen_there)
@@ -125,12 +124,7 @@ def test_scaled_by_the_variance_factor(estimated: Estimate) -> None:
     # Proves that only ratios of weights matter after scaling. Oracle: invariance under all weights times 4.
     problem, truth = packed(WELL, at_truth=True, kernel=Huber(jnp.asarray(1e6, float)), **OPTIONS)
     problem = jax.jit(monte_carlo.noisy)(problem, jax.random.key(0))
-    weights = lambda p: (
-        p.terms["points"].weight,
-        p.terms["lines"].weight,
-        p.terms["depth"].weight,
-        p.terms["intrinsics_prior"].weight,
-    )
+    weights = lambda p: tuple(p.terms[name].weight for name in ("points", "lines", "depth", "intrinsics_prior"))
     fourfold = eqx.tree_at(weights, problem, replace_fn=lambda weight: 4 * weight)
     plain, doubted = (estimated(p, truth).scaled() for p in (problem, fourfold))
     for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(doubted), strict=True):

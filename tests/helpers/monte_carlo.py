@@ -51,6 +51,9 @@ class Nees:
         return f"{self.name}: {self.mean:.3f}, expected {self.degrees}, 95 % band {low:.3f} to {high:.3f}"
 
 
+MEASURED = ("points", "target"), ("lines", "coefficients"), ("depth", "mean"), ("intrinsics_prior", "mean")
+
+
 def problems(kernel: AbstractKernel, count: int, first: int = 0) -> tuple[Problem, State]:
     """Scenes of the seeds from `first`, stacked, and their truths; noise-free.
 
@@ -76,12 +79,7 @@ def noisy(problem: Problem, key: Array) -> Problem:
     point = jnp.repeat(deviation(problem.terms["points"].weight)[..., None], 2, -1)
     depth = problem.terms["depth"].sigma * deviation(problem.terms["depth"].alpha * problem.terms["depth"].weight)
     return eqx.tree_at(
-        lambda p: (
-            p.terms["points"].target,
-            p.terms["lines"].coefficients,
-            p.terms["depth"].mean,
-            p.terms["intrinsics_prior"].mean,
-        ),
+        lambda p: tuple(getattr(p.terms[name], field) for name, field in MEASURED),
         problem,
         (
             problem.terms["points"].target + draw(keys[0], point),

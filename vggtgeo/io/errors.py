@@ -17,7 +17,7 @@ class InputError(ValueError):
         >>> vg.simulate("moon")  # doctest: +ELLIPSIS
         Traceback (most recent call last):
             ...
-        vggtgeo.io.errors.InputError: `scene` is 'moon'; it must be one of room, office, ...
+        vggtgeo.io.errors.InputError: `scene` must be one of room, office, ..., got 'moon'
 
     """
 

@@ -200,7 +200,7 @@ class WindowDataset:
         """
         part, parts = share
         if not 0 <= part < parts:
-            raise InputError(f"`share` is {share}; it must be (k, n) with 0 <= k < n")
+            raise InputError(f"`share` must be (k, n) with 0 <= k < n, got {share}")
         if not 1 <= size <= self.count // parts:
             raise InputError(f"`size` is {size}; this share has {self.count // parts} windows")
         return self._read(self._rows(size, seed, epochs, part, parts))

@@ -65,7 +65,7 @@ class Sensor:
         check_whole("blur_samples", self.blur_samples, 1, MAX_SAMPLES)
         near, far = real_array("depth_range", self.depth_range, (2,))
         if not 0 <= near < far:
-            raise InputError(f"`depth_range` is {self.depth_range}; it must be (near, far) with 0 <= near < far")
+            raise InputError(f"`depth_range` must be (near, far) with 0 <= near < far, got {self.depth_range}")
 
     def gain(self, time: float) -> float:
         """Return the exposure factor at `time` seconds, about 1."""
@@ -229,7 +229,7 @@ MAX_FRAMES, MAX_SIDE = 1_000_000, 8192
 def check_walk(scene: str, frames: int, size: tuple[int, int], rate: float, speed: float | None) -> None:
     """Raise InputError for what `simulate` cannot take."""
     if scene not in tuple(WORLDS):
-        raise InputError(f"`scene` is {scene!r}; it must be one of {', '.join(WORLDS)}")
+        raise InputError(f"`scene` must be one of {', '.join(WORLDS)}, got {scene!r}")
     check_whole("frames", frames, 1, MAX_FRAMES)
     for side in real_array("size", size, (2,)):
         check_whole("size", side, 1, MAX_SIDE)

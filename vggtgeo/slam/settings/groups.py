@@ -72,7 +72,7 @@ class CheckedSettings:
         for entry in fields(self):
             expected, value = entry.metadata["expected"], getattr(self, entry.name)
             if not expected.holds(value):
-                raise InputError(f"`{self.group}.{entry.name}` is {value!r:.60}; it must be {expected.words}")
+                raise InputError(f"`{self.group}.{entry.name}` must be {expected.words}, got {value!r:.60}")
 
 
 def _field(default: Any, expected: Expected) -> Any:
@@ -105,7 +105,7 @@ class KeyframeSettings(CheckedSettings):
         >>> vg.settings.KeyframeSettings(keyframe_distance=0.0)
         Traceback (most recent call last):
             ...
-        vggtgeo.io.errors.InputError: `keyframes.keyframe_distance` is 0.0; it must be a number above 0
+        vggtgeo.io.errors.InputError: `keyframes.keyframe_distance` must be a number above 0, got 0.0
 
     """
 
@@ -157,7 +157,7 @@ class DepthSettings(CheckedSettings):
         >>> vg.settings.DepthSettings(depth_trust="omega")
         Traceback (most recent call last):
             ...
-        vggtgeo.io.errors.InputError: `depth_terms.depth_trust` is 'omega'; it must be own, saliency or complement
+        vggtgeo.io.errors.InputError: `depth_terms.depth_trust` must be own, saliency or complement, got 'omega'
 
     """
 

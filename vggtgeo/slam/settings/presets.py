@@ -171,7 +171,7 @@ def perception(
     if memory_limit_gb is not None:
         check_positive("memory_limit_gb", memory_limit_gb, "gigabytes")
     if provider not in get_args(Provider):
-        raise InputError(f"`provider` is {provider!r:.60}; it must be one of {', '.join(get_args(Provider))}")
+        raise InputError(f"`provider` must be one of {', '.join(get_args(Provider))}, got {provider!r:.60}")
     chosen = _parts(preset, mixed or {})
     classical = classical or Roles()
     if chosen.get("points") == "orb":
@@ -200,7 +200,7 @@ def perception(
 def _parts(preset: str, mixed: Mapping[str, str]) -> dict[str, str]:
     """Return the implementation of each role that preset or caller name; raise InputError for an unknown name."""
     if preset not in tuple(PRESETS):  # a list has no hash
-        raise InputError(f"`preset` is {preset!r}; it must be one of {', '.join(PRESETS)}")
+        raise InputError(f"`preset` must be one of {', '.join(PRESETS)}, got {preset!r}")
     for role, name in mixed.items():
         if name not in CHOICES.get(role, ()):
             known = "; ".join(f"{role}: {', '.join(names)}" for role, names in CHOICES.items())

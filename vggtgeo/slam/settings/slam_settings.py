@@ -182,4 +182,4 @@ class SlamSettings:
             kind: Any = entry.default_factory
             value = getattr(self, entry.name)
             if not isinstance(value, kind):
-                raise InputError(f"`{entry.name}` is {value!r}; it must be a `vggtgeo.{entry.type}`")
+                raise InputError(f"`{entry.name}` must be a `vggtgeo.{entry.type}`, got {value!r}")

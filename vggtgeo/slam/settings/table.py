@@ -43,7 +43,7 @@ def updated(settings: SlamSettings, tables: Tables) -> SlamSettings:
     groups: dict[str, Any] = {}
     for group, values in tables.items():
         if group not in GROUPS:
-            raise InputError(f"`{group}` is no group of settings; it must be one of {', '.join(GROUPS)}")
+            raise InputError(f"groups of settings must be among {', '.join(GROUPS)}, got `{group}`")
         for field in values:
             _check_name(f"{group}.{field}")
         plain = {
@@ -118,5 +118,5 @@ def _kernel(name: str, text: str) -> AbstractKernel:
         kernel = None
     if kernel is None or not is_kernel(kernel):
         expected = f"one of {', '.join(KERNELS)} and its numbers, the width above 0, such as `cauchy 2.0`"
-        raise InputError(f"`{name}` is {text!r}; it must be {expected}")
+        raise InputError(f"`{name}` must be {expected}, got {text!r}")
     return kernel
