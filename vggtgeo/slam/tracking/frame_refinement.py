@@ -26,7 +26,7 @@ from vggtgeo.slam.threads import map_in_threads
 from vggtgeo.slam.tracking.accumulated_odometry import squared_distance
 from vggtgeo.slam.tracking.frame_tracking import view_of
 from vggtgeo.slam.tracking.local_map_tracking import in_view
-from vggtgeo.slam.tracking.pose_acceptance import FAIR, MIN_OVERLAP, MIN_SURFACE, TrackingQuality
+from vggtgeo.slam.tracking.pose_acceptance import MIN_CORRELATION, MIN_OVERLAP, MIN_SURFACE, TrackingQuality
 from vggtgeo.slam.tracking.pose_fusion import with_systematic
 from vggtgeo.slam.tracking.tracking_state import FramePose, SecondMotion, Tracker, frame_pose
 
@@ -120,7 +120,7 @@ def by_both(known: Map, frames: Sequence[FramePose], poses: np.ndarray) -> np.nd
 def _shows(found: Aligned) -> bool:
     """Return whether image and surface agree, as `TrackingQuality.dense_fair`; comparisons with NaN are false."""
     surface = not found.surface < MIN_SURFACE
-    return bool(found.correlation >= FAIR and found.overlap >= MIN_OVERLAP and surface)
+    return bool(found.correlation >= MIN_CORRELATION and found.overlap >= MIN_OVERLAP and surface)
 
 
 def tracked_information(quality: TrackingQuality) -> np.ndarray:

@@ -25,17 +25,14 @@ from vggtgeo.geometry.robust import POSE_GATE, inverse_information
 NAN = float("nan")
 MIN_INLIERS, STRONG_INLIERS = 12, 30
 """Number of points that are inliers."""
-FAIR = 0.4
-"""Share of the matches, of points or of lines, that are inliers, and correlation of the brightness at edges, of
-evidence that needs another kind beside it."""
-STRONG_SHARE = 0.5
-"""Share of the matches of evidence that suffices alone."""
+MIN_SHARE, STRONG_SHARE, PLACE_SHARE = 0.4, 0.5, 0.6
+"""Share of the matches, of points or of lines, that are inliers: beside evidence of another kind, alone, and at a place
+that was found by its appearance."""
 MIN_LINES, STRONG_LINES = 8, 12
 """Number of segments that are matched in agreement with the pose."""
-SURE = 0.6
-"""Correlation that suffices alone, and share of the matches at a place that was found by its appearance."""
-CONTRADICTION = 0.1
-"""Correlation below which the image contradicts the pose, whatever else agrees: that of wrong poses."""
+MIN_CORRELATION, STRONG_CORRELATION, CONTRADICTION = 0.4, 0.6, 0.1
+"""Correlation of the brightness at edges: beside other evidence, alone, and that of wrong poses, below which the image
+contradicts the pose, whatever else agrees."""
 MIN_SURFACE, MIN_OVERLAP = 0.85, 0.2
 """Share of the surface that agrees, and overlap, beside a correlation: 15 % may be hidden, moved or noise, and the rest
 must be seen on a fifth of the image."""
@@ -101,7 +98,7 @@ class TrackingQuality:
 
     @property
     def points_fair(self) -> bool:
-        return self.inliers >= MIN_INLIERS and self.share >= FAIR
+        return self.inliers >= MIN_INLIERS and self.share >= MIN_SHARE
 
     @property
     def points_strong(self) -> bool:
@@ -118,7 +115,7 @@ class TrackingQuality:
 
     @property
     def lines_fair(self) -> bool:
-        return self.lines >= MIN_LINES and self.line_share >= FAIR
+        return self.lines >= MIN_LINES and self.line_share >= MIN_SHARE
 
     @property
     def lines_strong(self) -> bool:
@@ -129,13 +126,13 @@ class TrackingQuality:
     def dense_fair(self) -> bool:
         """Whether image and surface agree with the pose; a comparison with NaN is false."""
         surface = not self.surface < MIN_SURFACE
-        return self.correlation >= FAIR and self.overlap >= MIN_OVERLAP and surface
+        return self.correlation >= MIN_CORRELATION and self.overlap >= MIN_OVERLAP and surface
 
     @property
     def dense_strong(self) -> bool:
         """Whether image, or image and surface together, suffice alone."""
         surfaces = self.surface >= BARE_SURFACE and self.overlap >= BARE_OVERLAP
-        return self.dense_fair and (self.correlation >= SURE or surfaces)
+        return self.dense_fair and (self.correlation >= STRONG_CORRELATION or surfaces)
 
     @property
     def bare_surface(self) -> bool:
@@ -156,16 +153,16 @@ class TrackingQuality:
             # confirm it.
             return self.points_strong and self.dense_fair
         # A NaN correlation (nothing to compare) does not contradict.
-        fair = self.points_fair and not self.correlation < FAIR
+        fair = self.points_fair and not self.correlation < MIN_CORRELATION
         by_lines = self.lines_strong or (self.lines_fair and self.dense_fair)
         return self.points_strong or fair or self.dense_strong or self.bare_surface or by_lines
 
     @property
     def certain(self) -> bool:
         """Whether the pose is accepted without a prediction, among all places of the map (relocalization)."""
-        known_place = self.inliers >= STRONG_INLIERS and self.share >= SURE
+        known_place = self.inliers >= STRONG_INLIERS and self.share >= PLACE_SHARE
         measured = self.sigma_translation <= MAX_SIGMA * self.metre
-        return measured and known_place and not self.correlation < FAIR
+        return measured and known_place and not self.correlation < MIN_CORRELATION
 
 
 def step_chi2(pose: np.ndarray, predicted: np.ndarray, step: np.ndarray, waited: int = 0) -> float:
