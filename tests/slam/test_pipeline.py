@@ -130,12 +130,12 @@ def test_global_adjustment_brings_a_map_back(room: Room, tracked: Slam, surfaces
 
 
 def test_the_size_of_the_map_is_foreseen_a_few_times() -> None:
-    """At a quarter of the frames a map of 5 keyframes will have 20, between the checks nothing is foreseen, and without
-    an end the map itself counts; oracle: by hand.
+    """At a quarter of the frames a map of 5 keyframes will have 20; between checks, and long before the end, nothing
+    is foreseen, and without an end the map itself counts; oracle: by hand.
     """
-    assert expected_keyframes(5, 25, 100) == 20
-    assert expected_keyframes(5, 26, 100) is None
-    assert [expected_keyframes(count, 31, None) for count in (7, 8, 70)] == [None, 8, 70]
+    assert expected_keyframes(5, 25, 100, 0.1) == 20
+    assert [expected_keyframes(5, *at) for at in ((26, 100, 0.1), (25, 100, 1.0))] == [None, None]
+    assert [expected_keyframes(count, 31, None, 1.0) for count in (7, 8, 70)] == [None, 8, 70]
 
 
 def test_a_window_of_three_around_an_old_keyframe_keeps_it(tracked: Slam) -> None:

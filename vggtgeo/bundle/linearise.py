@@ -13,11 +13,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vggtgeo.bundle.objective import Edge, SeenAlong, cameras_of, edge_views, pixel_observations
+from vggtgeo.bundle.objective import Edge, SeenAlong, cameras_of, edge_views, if_observed, pixel_observations
 from vggtgeo.bundle.problem import MAX_INVERSE_DEPTH, MIN_INVERSE_DEPTH, Problem, State
 from vggtgeo.bundle.terms.landmark_edge import EdgeTerm, EdgeView, products
 from vggtgeo.bundle.terms.node import PairTerm, node_models
@@ -96,10 +97,10 @@ def _edge_terms(
 
     def body(carry: tuple[Array, Array | None], edge: Edge) -> tuple[tuple[Array, Array | None], Array]:
         (cross, blocks), row, index = carry, edge.row, edge.index_at_host
-        gram, coupled, pixel_blocks = _edge_model(seen_along(edge), correction, sizes, exact)
+        gram, coupled, pixel_blocks = if_observed(edge, lambda: _edge_model(seen_along(edge), correction, sizes, exact))
         zero = jnp.zeros_like(row)
-        for first, part in coupled:
-            column = zero + first
+        for columns in coupled:
+            column, part = zero + columns.first, columns.values
             cross = jax.lax.dynamic_update_slice(cross, part[None, : lie.TANGENT], (row, lie.TANGENT * index, column))
             if apart:
                 by_target = part[None, lie.TANGENT : lie.TANGENT + apart]
@@ -167,8 +168,8 @@ def energy_gradient(problem: Problem, state: State) -> ArrowVector:
             found = term.gradient(seen)
             local += found.shared
             by_unknown = [part[None] for part in (*([] if found.pixel is None else found.pixel), found.depth)]
-            for start, part in _columns_at_landmarks(term, seen, by_unknown, sizes):
-                own = own.at[start : start + part.shape[1]].add(part[0])
+            for part in _columns_at_landmarks(term, seen, by_unknown, sizes):
+                own = own.at[part.first : part.first + part.values.shape[1]].add(part.values[0])
         return local, own
 
     local, by_depth = jax.vmap(along)(edges)
@@ -218,8 +219,13 @@ def lie_curvature(gradient: Float[Array, "e 6"]) -> Float[Array, "e 6 6"]:
 
 
 TermsOfEdge = Sequence[tuple[EdgeTerm, EdgeView]]
-Columns = list[tuple[int, Float[Array, "r _"]]]
-"""Blocks of columns, each with its first column."""
+
+
+class Columns(eqx.Module):
+    """A block of columns, and the position of its first."""
+
+    first: int = eqx.field(static=True)
+    values: Float[Array, "r _"]
 
 
 class _TermModel(NamedTuple):
@@ -244,17 +250,17 @@ def offsets_of(landmarks: Float[Array, "n t"]) -> Float[Array, "n p 2"]:
 
 def _edge_model(
     seen: TermsOfEdge, correction: Float[Array, ""] | None, sizes: tuple[int, int], exact: bool
-) -> tuple[Array, Columns, Array | None]:
+) -> tuple[Array, list[Columns], Array | None]:
     """Return Gram matrix, cross terms and blocks of landmarks with free pixels of one edge, all terms added up."""
     models = [_exact(*one) for one in seen] if exact else _reweighted(seen, correction)
-    columns: Columns = []
-    pixels: Columns = []
+    columns: list[Columns] = []
+    pixels: list[Columns] = []
     for (term, view), model in zip(seen, models, strict=True):
         columns += _columns_at_landmarks(term, view, model.coupled, sizes)
         if model.pixels is not None:
-            pixels.append((term.first_slot, model.pixels[:, : view.free_pixels]))
+            pixels.append(Columns(term.first_slot, model.pixels[:, : view.free_pixels]))
     free, slots = sizes
-    joint = jnp.concatenate([part for _, part in _merge_columns(pixels, free)], 1) if pixels else None
+    joint = jnp.concatenate([part.values for part in _merge_columns(pixels, free)], 1) if pixels else None
     gram = sum((model.gram for model in models[1:]), models[0].gram)
     return gram, _merge_columns(columns, 2 * free + slots), joint
 
@@ -283,23 +289,25 @@ def _exact(term: EdgeTerm, view: EdgeView) -> _TermModel:
     return _TermModel(model.gram, [*by_pixel, model.coupled], model.pixels.blocks)
 
 
-def _columns_at_landmarks(term: EdgeTerm, view: EdgeView, by_unknown: list[Array], sizes: tuple[int, int]) -> Columns:
-    """Return the columns of a term by `u`, `v` (if free) and inverse depth, with their landmark positions."""
+def _columns_at_landmarks(
+    term: EdgeTerm, view: EdgeView, by_unknown: list[Array], sizes: tuple[int, int]
+) -> list[Columns]:
+    """Return the columns of a term by `u`, `v` (if free) and inverse depth, at their landmark positions."""
     free, points = view.free_pixels, sizes[0]
     *pixels, depth = by_unknown
-    by_pixel = [(axis * points + term.first_slot, own[:, :free]) for axis, own in enumerate(pixels)]
-    return [*by_pixel, (2 * points + term.first_slot, depth)]
+    by_pixel = [Columns(axis * points + term.first_slot, own[:, :free]) for axis, own in enumerate(pixels)]
+    return [*by_pixel, Columns(2 * points + term.first_slot, depth)]
 
 
-def _merge_columns(parts: Columns, size: int) -> Columns:
-    """Merge blocks of columns to blocks that cover all `size` columns once, each with its first column."""
-    ends = [start + part.shape[1] for start, part in parts]
-    if [0, *ends] == [*(start for start, _ in parts), size]:
+def _merge_columns(parts: list[Columns], size: int) -> list[Columns]:
+    """Merge blocks of columns to blocks that cover all `size` columns once."""
+    ends = [part.first + part.values.shape[1] for part in parts]
+    if [0, *ends] == [*(part.first for part in parts), size]:
         return parts  # contiguous, as points and lines are: neither padding nor a sum
-    total = jnp.zeros((len(parts[0][1]), size), parts[0][1].dtype)
-    for start, part in parts:
-        total = total.at[:, start : start + part.shape[1]].add(part)
-    return [(0, total)]
+    total = jnp.zeros((len(parts[0].values), size), parts[0].values.dtype)
+    for part, end in zip(parts, ends, strict=True):
+        total = total.at[:, part.first : end].add(part.values)
+    return [Columns(0, total)]
 
 
 def _depth_terms(

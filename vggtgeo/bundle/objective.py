@@ -6,7 +6,7 @@ The solver minimises exactly this energy, with the same functions.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,8 @@ from vggtgeo.bundle.terms.node import CameraTerm, DenseTerm, NodeTerm, node_resi
 from vggtgeo.bundle.terms.term import AbstractTerm, robust_energy
 from vggtgeo.geometry import lie
 from vggtgeo.geometry.camera_models import Cameras
+
+Result = TypeVar("Result")
 
 
 def energy(problem: Problem, state: State) -> Float[Array, ""]:
@@ -80,7 +82,8 @@ def prepared_energy(problem: Problem, state: State) -> Float[Array, ""]:
     edges, seen_along = edge_views(problem, state)
 
     def body(sum_: Array, edge: Edge) -> tuple[Array, None]:
-        return sum_ + sum(term.energy(view) for term, view in seen_along(edge)), None
+        own = lambda: jnp.asarray(sum(term.energy(view) for term, view in seen_along(edge)))
+        return sum_ + if_observed(edge, own), None
 
     # A scan keeps one edge's projections in memory, not those of all edges.
     total, _ = jax.lax.scan(body, total, edges)
@@ -168,6 +171,14 @@ class Edge(NamedTuple):
 
 
 SeenAlong = Callable[[Edge], list[tuple[EdgeTerm, EdgeView]]]
+
+
+def if_observed(edge: Edge, result: Callable[[], Result]) -> Result:
+    """Return `result()`, or zeros of its shape if nothing is observed along the edge: padding then costs no time."""
+    observed = jnp.any(jnp.stack([jnp.any(data["weight"] > 0) for data in edge.data]))
+    zeros = lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(result))
+    found: Result = jax.lax.cond(observed, result, zeros)
+    return found
 
 
 def edge_views(problem: Problem, state: State) -> tuple[Edge, SeenAlong]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
 
@@ -15,9 +16,7 @@ from vggtgeo.slam.camera.pixel_aspect import aspect_prior
 from vggtgeo.slam.global_map.depth_alignment import align_pairs
 from vggtgeo.slam.global_map.global_adjustment import shares_focal
 from vggtgeo.slam.global_map.padded_shapes import (
-    EDGE_SHARES,
     MAX_DENSE,
-    MAX_NEIGHBOURS,
     SMALL,
     PaddedShape,
     global_solver,
@@ -30,12 +29,11 @@ from vggtgeo.slam.sparse_map.factors import factor_terms
 from vggtgeo.slam.state import Slam
 from vggtgeo.slam.window.sliding_window import smallest_problem, solve_jit, warm_up
 
-CHECKS = 4
-"""The number of keyframes is predicted after each but the last of so many parts of the frames: early for time, and
-again for accuracy."""
-GUIDED = 1.4
-"""Edges with guided matches (`guided_matches.py`), relative to those without: 1.21 and 1.43 on two walks. A wrong guess
-costs only time."""
+CHECKS = 8
+"""The number of keyframes is predicted after each of so many parts of the frames but the first and the last."""
+LEAD = 12.0
+"""Seconds before the end from which a prediction counts: compilation takes about as long beside a run. Earlier ones are
+less accurate, and programs of wrong shapes cost the run as much time."""
 MIN_KEYFRAMES = 8
 """For an unknown number of frames: smaller maps may stay small."""
 
@@ -49,6 +47,7 @@ class CompileAhead(Callback):
     def __init__(self, settings: SlamSettings) -> None:
         self._settings = settings
         self._total: int | None = None
+        self._began: tuple[float, int] | None = None  # time and number of frames at the first call
         self._asked: dict[PaddedShape, Future[None]] = {}
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="compile")
 
@@ -56,39 +55,32 @@ class CompileAhead(Callback):
         self._total = total
 
     def on_frame(self, slam: Slam, frame: Frame) -> None:
-        count = expected_keyframes(len(slam.keyframes), len(slam.frames), self._total)
-        if count is None or not slam.keyframes or not self._settings.refinement.global_adjustment:
+        now, frames = time.monotonic(), len(slam.frames)
+        since, before = self._began = self._began or (now, frames - 1)
+        count = expected_keyframes(len(slam.keyframes), frames, self._total, (now - since) / (frames - before))
+        if not count or not self._settings.refinement.global_adjustment:
             return
-        for shape in self._shapes(slam, count):
-            if shape.size.keyframes <= MAX_DENSE and shape not in self._asked:
-                task = partial(compile_global, shape, self._settings, shares_focal(slam), metric=slam.metric)
-                self._asked[shape] = self._pool.submit(task)
+        shape = shape_for(count, self._settings, slam.metric)
+        if shape.size.keyframes <= MAX_DENSE and shape not in self._asked:
+            task = partial(compile_global, shape, self._settings, shares_focal(slam), metric=slam.metric)
+            self._asked[shape] = self._pool.submit(task)
 
     def on_adjust(self, slam: Slam) -> None:
         """Wait for the program that is needed now."""
-        future = self._asked.get(self._shapes(slam, len(slam.keyframes))[0]) if slam.keyframes else None
+        future = self._asked.get(shape_for(len(slam.keyframes), self._settings, slam.metric))
         if future is not None:
             wait([future])
 
-    def _shapes(self, slam: Slam, keyframes: int) -> list[PaddedShape]:
-        """Return the shapes of a map with so many keyframes: with as many edges for each as now, and without depth also
-        with the further edges of guided matches.
-        """
-        ends = np.array([pair.key for pair in slam.map.pairs], int).reshape(-1, 2)
-        edges = np.minimum(np.bincount(ends.ravel(), minlength=1), MAX_NEIGHBOURS).sum()
-        expected = round(edges * keyframes / len(slam.keyframes))
-        more = [] if slam.metric else [min(round(GUIDED * expected), MAX_NEIGHBOURS * keyframes)]
-        return [shape_for(keyframes, count, self._settings, slam.metric) for count in (expected, *more)]
 
-
-def expected_keyframes(keyframes: int, frames: int, total: int | None) -> int | None:
+def expected_keyframes(keyframes: int, frames: int, total: int | None, seconds: float) -> int | None:
     """Return the predicted number of keyframes, given `keyframes` after `frames` of `total` frames.
 
-    None at most frames: it is predicted a few times only.
+    None at most frames: it is predicted a few times near the end. seconds: that a frame takes.
     """
     if total is None:
         return keyframes if keyframes >= MIN_KEYFRAMES else None
-    if frames not in {part * total // CHECKS for part in range(1, CHECKS)}:
+    checks = {part * total // CHECKS for part in range(2, CHECKS)}
+    if frames not in checks or seconds * (total - frames) > LEAD:
         return None
     return keyframes * total // max(frames, 1)
 
@@ -119,9 +111,7 @@ def compile_before_runs(settings: SlamSettings, width: int, height: int) -> None
     Without recorded poses; images of this size.
     """
     compile_alignment(Camera.guess(width, height))
-    smallest, usual = SMALL
-    edges = [(smallest, 0), *((usual, int(share * MAX_NEIGHBOURS * usual)) for share in EDGE_SHARES)]
     for metric in (True, False):
         warm_up(settings, metric)
-        for keyframes, count in edges:
-            compile_global(shape_for(keyframes, count, settings, metric), settings, metric=metric)
+        for keyframes in SMALL:
+            compile_global(shape_for(keyframes, settings, metric), settings, metric=metric)

@@ -23,14 +23,10 @@ from vggtgeo.solvers.reduced_solvers import AbstractReducedSolver, DenseCholesky
 
 SMALL = (16, 64)
 """Keyframes of the smallest shapes, compiled for any run: a short clip, and a room. Larger: 96, 128, 192, 256, ..."""
-MAX_PADDING = 2.0
-"""Stored edges for each real one; a larger map with few edges keeps its own shape."""
 FACTORS, PAIRS = 2, 12
 """Room for tracked motions and pairs for each keyframe; an office sequence of 64 keyframes has 533 pairs."""
 MAX_NEIGHBOURS = 16
-"""Largest number of edges of one keyframe: it determines the padded size, and so time and memory of the adjustment."""
-EDGE_SHARES = (0.5, 0.75, 1.0)
-"""Stored edges as a share of the largest number: time is in proportion to them, and each is a program of its own."""
+"""Largest number of edges of one keyframe. All are stored, with 16 kB each; absent ones take hardly any time."""
 MAX_DENSE = 256
 """Keyframes up to which the reduced system is factorised as a dense matrix: at 200 as fast as conjugate gradients and
 half as fast as a band (docs/results/solver.md). But its program depends on the shape alone, not on the graph: it is
@@ -47,14 +43,13 @@ class PaddedShape(NamedTuple):
     pairs: int
 
 
-def shape_for(keyframes: int, edges: int, settings: SlamSettings, metric: bool = True) -> PaddedShape:
-    """Return the shape of a map of so many keyframes and edges, with odometry factors.
+def shape_for(keyframes: int, settings: SlamSettings, metric: bool = True) -> PaddedShape:
+    """Return the shape of a map of so many keyframes, with odometry factors.
 
     Without metric depth the first factor is the baseline that fixes the scale.
     """
     padded = padded_count(keyframes)
-    stored = padded_edges(edges, padded)
-    size = replace(window_size(settings), keyframes=padded, degree=MAX_NEIGHBOURS, edges=stored)
+    size = replace(window_size(settings), keyframes=padded, degree=MAX_NEIGHBOURS, edges=MAX_NEIGHBOURS * padded)
     baseline = () if metric else ((MeasuredBaseline, padded_count(1)),)
     return PaddedShape(size, (*baseline, (MeasuredRelativePose, FACTORS * padded)), PAIRS * padded)
 
@@ -62,16 +57,15 @@ def shape_for(keyframes: int, edges: int, settings: SlamSettings, metric: bool =
 def shape_of(
     keyframes: int, edges_of_host: Sequence[int], factors: Sequence[Factor], pairs: int, settings: SlamSettings
 ) -> PaddedShape:
-    """Return the shape of a map: that of `shape_for` if it fits.
+    """Return the shape of a map: that of `shape_for` with room for all factors; of a large map its own.
 
     edges_of_host: number of edges of each keyframe, at most `MAX_NEIGHBOURS`.
     """
-    edges, counts = sum(edges_of_host), Counter(type(factor) for factor in factors)
-    usual = shape_for(keyframes, edges, settings)
-    size = usual.size
-    if keyframes > SMALL[-1] and padded_edges(edges, size.keyframes) > MAX_PADDING * edges:
-        size = replace(size, keyframes=keyframes, degree=max(edges_of_host), edges=edges)
-    usual_room = dict(usual.room)
+    usual = shape_for(keyframes, settings)
+    size, usual_room = usual.size, dict(usual.room)
+    if keyframes > MAX_DENSE:  # its program depends on its graph anyway
+        size = replace(size, keyframes=keyframes, degree=max(edges_of_host), edges=sum(edges_of_host))
+    counts = Counter(type(factor) for factor in factors)
     room = tuple((kind, max(padded_count(count), usual_room.get(kind, 0))) for kind, count in counts.items())
     return PaddedShape(size, room, max(padded_count(pairs), usual.pairs))
 
@@ -80,14 +74,6 @@ def padded_count(count: int) -> int:
     """Return the smallest of 16, 64, 96, 128, 192, 256, ... that is at least `count`: at most a third is padding."""
     larger = (size << doubled for doubled in itertools.count() for size in (3 * SMALL[-1] // 2, 2 * SMALL[-1]))
     return next(size for size in itertools.chain(SMALL, larger) if size >= count)
-
-
-def padded_edges(edges: int, keyframes: int) -> int:
-    """Return the number of stored edges for so many, at most `MAX_NEIGHBOURS` for each of the padded keyframes."""
-    most = MAX_NEIGHBOURS * keyframes
-    if keyframes <= SMALL[0]:
-        return most
-    return next(int(share * most) for share in EDGE_SHARES if edges <= share * most)
 
 
 def global_solver(problem: Problem) -> SchurLevenbergMarquardt:
