@@ -11,7 +11,6 @@ looked up bilinearly.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -22,7 +21,7 @@ from vggtgeo.simulation.shapes import Blockers, Surfaces
 _WIDTH = 2048
 _AMBIENT_REACH, _AMBIENT_RAYS = 0.8, 12
 _BATCH = 60000  # segments times boxes tested at once: small enough for the cache
-_GROUP = 256  # points at most whose far boxes are left out at once
+_CELL = 1.0  # metres: points in a cube are tested together against the boxes in their way
 _LAMP_CELLS = 3  # a lamp is sampled once in each of 3 x 3 cells
 
 
@@ -53,7 +52,7 @@ def bake(
     points, normals = surfaces.points(which, s, t)
     points += 0.012 * normals
     starts = np.concatenate([[0], np.cumsum(sizes)])
-    samples = _Samples(points, normals, starts, blockers)
+    samples = _Samples(points, normals, blockers)
     light = ambient * samples.openness(rng)
     for lamp in lights:
         light += samples.lit_by(lamp, rng)
@@ -84,11 +83,10 @@ def _texels(surfaces: Surfaces, counts: np.ndarray) -> tuple[np.ndarray, ...]:
 
 @dataclass(frozen=True)
 class _Samples:
-    """Points [n, 3] on surfaces with their normals; starts: first sample of each surface."""
+    """Points [n, 3] on surfaces with their normals."""
 
     points: np.ndarray
     normals: np.ndarray
-    starts: np.ndarray
     blockers: Blockers
 
     def openness(self, rng: np.random.Generator) -> np.ndarray:
@@ -96,7 +94,7 @@ class _Samples:
         direction /= np.maximum(np.linalg.norm(direction, axis=2, keepdims=True), 1e-6)
         direction += self.normals[:, None]  # a uniform sphere on the tip of the normal: cosine-weighted directions
         direction /= np.maximum(np.linalg.norm(direction, axis=2, keepdims=True), 1e-6)
-        blocked = _shadowed(self.points, _AMBIENT_REACH * direction, self.blockers, self.starts)
+        blocked = _shadowed(self.points, _AMBIENT_REACH * direction, self.blockers)
         return 1.0 - 0.55 * blocked.mean(axis=1)
 
     def lit_by(self, lamp: tuple, rng: np.random.Generator) -> np.ndarray:
@@ -114,32 +112,47 @@ class _Samples:
         downward = np.clip(to_lamp[..., 2] / distance, 0, 1)
         gain = power * cosine * downward * np.clip(1 - (distance / reach) ** 4, 0, 1) / (square + 0.5)
         lit = np.nonzero(gain.max(axis=1, initial=0.0) > 1e-4)[0]
-        spans = np.searchsorted(near[lit], self.starts)
-        shadow = _shadowed(self.points[near[lit]], 0.97 * to_lamp[lit], self.blockers, spans)
+        shadow = _shadowed(self.points[near[lit]], 0.97 * to_lamp[lit], self.blockers)
         light[near[lit]] = (gain[lit] * ~shadow).mean(axis=1)
         return light
 
 
-def _shadowed(points: np.ndarray, rays: np.ndarray, blockers: Blockers, starts: np.ndarray) -> np.ndarray:
+def _shadowed(points: np.ndarray, rays: np.ndarray, blockers: Blockers) -> np.ndarray:
     """Return whether the segments points [n, 3] -> points + rays [n, S, 3] meet a box: bool [n, S].
 
-    `starts` groups points that lie together, so that far boxes are left out at once.
+    Points that lie together are tested at once, against the boxes that may be in their way.
     """
     points, rays = points.astype(np.float32), rays.astype(np.float32)
     blocked = np.zeros(rays.shape[:2], bool)
+    cells = np.floor(points / _CELL).astype(int)
+    order = np.lexsort(cells.T)
+    changes = np.flatnonzero(np.any(np.diff(cells[order], axis=0), axis=1)) + 1
+    for own in np.split(order, changes):
+        at, towards = points[own], rays[own]
+        boxes = _in_the_way(at, at[:, None] + towards, blockers)
+        batch = max(1, _BATCH // towards[..., 0].size)
+        for some in np.split(boxes, np.arange(batch, len(boxes), batch)):
+            blocked[own] |= _meets(at, towards, blockers, some)
+    return blocked
+
+
+def _in_the_way(starts: np.ndarray, ends: np.ndarray, blockers: Blockers) -> np.ndarray:
+    """Return the boxes that segments from `starts` [n, 3] to `ends` [n, S, 3] may meet, int [B].
+
+    All segments lie in the bounds of their ends, and around the line between the centres of starts and ends, within
+    the larger of both radii.
+    """
+    ends = ends.reshape(-1, 3)
     reach = np.hypot(blockers.half[:, 0], blockers.half[:, 1])
     reach = np.stack([reach, reach, blockers.half[:, 2]], axis=1)
-    low, high = blockers.centre - reach, blockers.centre + reach
-    for first, last in pairwise(np.unique([*starts, *range(0, len(points), _GROUP)]).tolist()):
-        at, towards = points[first:last], rays[first:last]
-        end = at[:, None] + towards
-        bottom = np.minimum(at.min(axis=0), end.min(axis=(0, 1)))
-        top = np.maximum(at.max(axis=0), end.max(axis=(0, 1)))
-        boxes = np.nonzero(np.all((low <= top) & (high >= bottom), axis=1))[0]
-        batch = max(1, _BATCH // (end.shape[0] * end.shape[1]))
-        for some in np.split(boxes, np.arange(batch, len(boxes), batch)):
-            blocked[first:last] |= _meets(at, towards, blockers, some)
-    return blocked
+    bottom, top = np.minimum(starts.min(0), ends.min(0)), np.maximum(starts.max(0), ends.max(0))
+    inside = np.all((blockers.centre - reach <= top) & (blockers.centre + reach >= bottom), axis=1)
+    first, last = starts.mean(0), ends.mean(0)
+    radius = max(np.linalg.norm(starts - first, axis=1).max(), np.linalg.norm(ends - last, axis=1).max())
+    along, offset = last - first, blockers.centre - first
+    share = np.clip(offset @ along / max(along @ along, 1e-9), 0, 1)
+    apart = np.linalg.norm(offset - share[:, None] * along, axis=1)
+    return np.flatnonzero(inside & (apart <= 1.001 * (radius + np.linalg.norm(blockers.half, axis=1))))
 
 
 def _meets(points: np.ndarray, rays: np.ndarray, blockers: Blockers, some: np.ndarray) -> np.ndarray:

@@ -5,8 +5,11 @@ of its camera: exposure, noise, motion blur, rolling exposure, depth errors.
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -133,10 +136,19 @@ class SyntheticSequence:
         return self.count
 
     def frames(self, start: int = 0, end: int | None = None, stride: int = 1) -> Iterator[Frame]:
-        """Render the frames at start, start + stride, ... below end; InputError if that selects none."""
+        """Render the frames at start, start + stride, ... below end, from the second on two at a time.
+
+        InputError if that selects none.
+        """
         check_selection(self.name, self.count, start, end, stride)
-        for index in range(start, min(self.count, end or self.count), stride):
-            yield self.frame(index)
+        indices = iter(range(start, min(self.count, end or self.count), stride))
+        yield self.frame(next(indices))
+        with ThreadPoolExecutor(2, thread_name_prefix="render") as pool:
+            ahead = deque(pool.submit(self.frame, index) for index in islice(indices, 2))
+            while ahead:
+                frame = ahead.popleft().result()
+                ahead.extend(pool.submit(self.frame, index) for index in islice(indices, 1))
+                yield frame
 
     def ground_truth(self) -> Trajectory:
         """Return the exact poses, camera -> world."""
