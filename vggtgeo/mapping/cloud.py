@@ -20,8 +20,8 @@ MAX_DIFFERENCE = 0.04
 """Largest relative difference of depth between a point and a keyframe that confirms it."""
 MAX_STEP = 0.1
 """Relative difference of depth of neighbouring samples above which they are on different surfaces: no normal."""
-BATCH = 64
-"""Keyframes whose points are averaged at a time: the points of one take 2 MB."""
+BATCH = 16
+"""Keyframes whose points are averaged at a time: those of one take 2 MB, and averaging them three times that."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,8 +37,8 @@ TRUNCATION = 4.0
 """Of the distance, in voxels."""
 FREE = 4.0
 """Distance in front of a surface that a view marks as free, in truncations: at most a block, see `views_near`."""
-BATCH = 512
-"""Blocks per thread at a time: 60 MB."""
+BATCH = 256
+"""Blocks per thread at a time: 30 MB."""
 GROUP = 32
 """Blocks per compiled call."""
 MIN_CONFIDENCE = 0.5
