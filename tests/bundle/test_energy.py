@@ -139,6 +139,15 @@ def test_absent_observations_may_hold_anything() -> None:
     np.testing.assert_array_equal(gradient, clean_gradient)
 
 
+@pytest.mark.parametrize("invalid", [np.nan, -1.0])
+def test_an_edge_of_invalid_weights_alone_is_no_padding(invalid: float) -> None:
+    # Proves that weights which are invalid are not skipped as absent, if an edge has no others. Oracle: NaN.
+    problem, state, _ = NOISY.pack()
+    weight = problem.terms["points"].weight.at[0].set(invalid)
+    alone = problem.with_term(problem.terms["lines"].reweighted(problem.terms["lines"].weight.at[0].set(0.0)))
+    assert jnp.isnan(energy(alone.with_term(problem.terms["points"].reweighted(weight)), state))
+
+
 PIXEL, DEPTH = np.array([71.5, 180.25]), 2.6
 
 

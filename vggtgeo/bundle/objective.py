@@ -175,7 +175,8 @@ SeenAlong = Callable[[Edge], list[tuple[EdgeTerm, EdgeView]]]
 
 def if_observed(edge: Edge, result: Callable[[], Result]) -> Result:
     """Return `result()`, or zeros of its shape if nothing is observed along the edge: padding then costs no time."""
-    observed = jnp.any(jnp.stack([jnp.any(data["weight"] > 0) for data in edge.data]))
+    # Not `> 0`: an invalid weight is NaN here, which must reach the energy (`AbstractTerm.prepared`).
+    observed = jnp.any(jnp.stack([jnp.any(data["weight"] != 0) for data in edge.data]))
     zeros = lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(result))
     found: Result = jax.lax.cond(observed, result, zeros)
     return found

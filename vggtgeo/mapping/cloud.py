@@ -21,7 +21,7 @@ MAX_DIFFERENCE = 0.04
 MAX_STEP = 0.1
 """Relative difference of depth of neighbouring samples above which they are on different surfaces: no normal."""
 BATCH = 16
-"""Keyframes whose points are averaged at a time: those of one take 2 MB, and averaging them three times that."""
+"""Keyframes whose points are averaged at a time: the points of one take 2 MB."""
 
 
 @dataclass(frozen=True, eq=False)

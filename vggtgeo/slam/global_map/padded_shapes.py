@@ -1,6 +1,6 @@
 """Padded shapes of the global adjustment: a program compiled for one map is used for others of about its size.
 
-Compiling takes 20 s of one core without a JIT cache, solving 0.8 s (64 keyframes). So a map is padded generously, and
+Compiling takes 5 to 10 s of one core without a cache, solving 0.8 s (64 keyframes). So a map is padded generously, and
 the program of the padded shape can be compiled during the run (`compile_ahead.py`).
 """
 
@@ -57,14 +57,16 @@ def shape_for(keyframes: int, settings: SlamSettings, metric: bool = True) -> Pa
 def shape_of(
     keyframes: int, edges_of_host: Sequence[int], factors: Sequence[Factor], pairs: int, settings: SlamSettings
 ) -> PaddedShape:
-    """Return the shape of a map: that of `shape_for` with room for all factors; of a large map its own.
+    """Return the shape of a map: that of `shape_for` with room for all factors; of a large map its own, as long as its
+    keyframes and their largest number of edges stay.
 
     edges_of_host: number of edges of each keyframe, at most `MAX_NEIGHBOURS`.
     """
     usual = shape_for(keyframes, settings)
     size, usual_room = usual.size, dict(usual.room)
-    if keyframes > MAX_DENSE:  # its program depends on its graph anyway
-        size = replace(size, keyframes=keyframes, degree=max(edges_of_host), edges=sum(edges_of_host))
+    if keyframes > MAX_DENSE:  # hosts with room for more edges than any has would take memory and time
+        degree = max(edges_of_host)
+        size = replace(size, keyframes=keyframes, degree=degree, edges=degree * keyframes)
     counts = Counter(type(factor) for factor in factors)
     room = tuple((kind, max(padded_count(count), usual_room.get(kind, 0))) for kind, count in counts.items())
     return PaddedShape(size, room, max(padded_count(pairs), usual.pairs))
