@@ -12,7 +12,7 @@ from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from vggtgeo.io.errors import InputError, install_hint
 from vggtgeo.io.files import atomic_path
@@ -108,7 +108,7 @@ class Summary:
         if not count:
             return cls(0, np.nan, np.nan, np.nan, np.nan)
         deviation = float(np.std(known, ddof=1)) if count > 1 else np.nan
-        half = float(student.ppf(0.5 + LEVEL / 2, count - 1)) * deviation / np.sqrt(count) if count > 1 else np.nan
+        half = float(stdtrit(count - 1, 0.5 + LEVEL / 2)) * deviation / np.sqrt(count) if count > 1 else np.nan
         return cls(count, float(known.mean()), deviation, float(half), float(np.median(known)))
 
     @property

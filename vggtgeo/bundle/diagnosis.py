@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy import stats
+from scipy.special import chdtri, fdtri
 
 from vggtgeo.bundle.analysis.weak_directions import rigid_motions
 from vggtgeo.bundle.linearise import free_coordinates
@@ -120,8 +120,8 @@ class Diagnosis(eqx.Module):
         saved, redundancy = float(self.saved[k]), int(self.redundancy)
         rest = (float(self.energy) - saved) / max(redundancy - lie.TANGENT, 1)
         # F-test of six more unknowns: the noise level of the weights is unknown, so the other residuals provide it.
-        limit = float(stats.f.isf(SIGNIFICANCE, lie.TANGENT, max(redundancy - lie.TANGENT, 1)))
-        if not saved > limit * lie.TANGENT * max(rest, 0.0) or not saved > stats.chi2.isf(SIGNIFICANCE, lie.TANGENT):
+        limit = float(fdtri(lie.TANGENT, max(redundancy - lie.TANGENT, 1), 1 - SIGNIFICANCE))
+        if not saved > limit * lie.TANGENT * max(rest, 0.0) or not saved > chdtri(lie.TANGENT, SIGNIFICANCE):
             return ""
         metres, radians = (float(np.linalg.norm(half)) for half in np.split(np.asarray(self.motion[k]), 2))
         return (
@@ -267,7 +267,7 @@ def _share(which: Bool[Array, "*b"], present: Bool[Array, "*b"]) -> Float[Array,
 
 def _rejected(term: AbstractTerm, own: Observed) -> Float[Array, ""]:
     # `w |r|^2` of Gaussian noise is chi-square with as many degrees of freedom as the residual has entries.
-    level = float(stats.chi2.isf(SIGNIFICANCE, own.entries))
+    level = float(chdtri(own.entries, SIGNIFICANCE))
     # The derivative of the force `rho'(s) r` along the residual: negative where the kernel redescends.
     weight = term.kernel.weight(own.squared)
     rises = weight + 2 * own.squared * term.kernel.curvature(own.squared)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import cholesky_banded, solve_banded
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from vggtgeo.evaluation.alignment import umeyama
 from vggtgeo.evaluation.association import ContinuousTrajectory
@@ -366,7 +366,7 @@ class OffsetModel:
         own, other = (self._whitened(one, noise) * (self._prior * free) for one in jacobians)
         values, vectors = np.linalg.eigh(0.5 * (other.T @ own + own.T @ other))
         lengths = np.sqrt(((own @ vectors) ** 2).sum(axis=0) * ((other @ vectors) ** 2).sum(axis=0))
-        chance = norm.ppf(1 - LEVEL / 2) / np.sqrt(0.5 * len(own))
+        chance = -ndtri(LEVEL / 2) / np.sqrt(0.5 * len(own))
         basis = vectors[:, (values > _MIN_GAIN) & (values > chance * lengths)]
         return own @ basis, other @ basis, basis
 

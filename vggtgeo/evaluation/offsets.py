@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
 
 from vggtgeo.evaluation.association import MAX_TIME_DIFFERENCE, ContinuousTrajectory, associate, shifted
 from vggtgeo.evaluation.comparability import MAX_LEFT, comparability
@@ -198,7 +198,7 @@ def _p_value(fit: Fit, part: slice) -> float:
     covariance = fit.covariance[part, part][np.ix_(known, known)]
     # A pseudoinverse, since exact paths without rotation determine an offset only in some directions.
     statistic = value[known] @ np.linalg.pinv(covariance, hermitian=True) @ value[known] / known.sum()
-    return float(fisher.sf(statistic, known.sum(), fit.degrees))
+    return float(fdtrc(known.sum(), fit.degrees, statistic))
 
 
 def _numbers(values: Iterable[float], sds: Iterable[float], unit: str = "") -> str:

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.bundle.residual_values import residuals_at
@@ -102,7 +102,7 @@ def gain(
     mean = sums.sum() / total
     by_keyframe = np.sqrt(hosts / free * np.sum((sums - mean * counts) ** 2)) / total
     by_match = np.sqrt(np.sum((fall[chosen] - mean) ** 2)) / total
-    return float(mean), float(student_t.isf(CHANCE, free) * max(by_keyframe, by_match))
+    return float(mean), float(-stdtrit(free, CHANCE) * max(by_keyframe, by_match))
 
 
 def match_energies(problem: Problem, state: State) -> np.ndarray:

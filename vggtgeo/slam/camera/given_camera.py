@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import chi2 as chi_square
+from scipy.special import chdtri
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import lie, rigid
@@ -176,7 +176,7 @@ def _averaged(estimate: PairwiseIntrinsics, given: np.ndarray) -> tuple[np.ndarr
     sure = float(np.sum(along[kept] ** 2 / np.maximum(shares[kept], TINY)))
     step = directions @ np.where(kept, along / (1.0 + shares), 0.0) / units
     wanted = np.array([*(given[:2] * np.exp(step[0])), *(given[2:] + step[1:])])
-    return wanted, bool(kept.any()) and sure > float(chi_square.isf(CHANCE, np.count_nonzero(kept)))
+    return wanted, bool(kept.any()) and sure > float(chdtri(np.count_nonzero(kept), CHANCE))
 
 
 def _held_out(problem: Problem) -> np.ndarray:

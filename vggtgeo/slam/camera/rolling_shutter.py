@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 from vggtgeo.bundle.problem import Problem, State
 from vggtgeo.geometry import pinhole, rigid
@@ -215,7 +215,7 @@ def find_readout(
         slopes = slopes[slopes != 0]
         if len(slopes) < MIN_HOSTS:
             continue
-        sure = abs(slopes.sum()) / np.sqrt(np.sum(slopes**2)) / student_t.isf(WORTH_A_TRIAL, len(slopes) - 1)
+        sure = abs(slopes.sum()) / np.sqrt(np.sum(slopes**2)) / -stdtrit(len(slopes) - 1, WORTH_A_TRIAL)
         if sure > max(surest, 1.0):
             chosen, surest = (columns, search, float(slopes.sum())), sure
     if chosen is None:

@@ -17,9 +17,9 @@ from vggtgeo.slam.global_map.depth_alignment import align_pairs
 from vggtgeo.slam.global_map.global_adjustment import shares_focal
 from vggtgeo.slam.global_map.padded_shapes import (
     MAX_DENSE,
-    SMALL,
     PaddedShape,
     global_solver,
+    padded_count,
     shape_for,
 )
 from vggtgeo.slam.global_map.pose_uncertainty import keyframe_sigma
@@ -106,12 +106,13 @@ def compile_global(
 
 
 def compile_before_runs(settings: SlamSettings, width: int, height: int) -> None:
-    """Compile for maps of at most 64 keyframes in one submap, with depth and without, of a known camera.
+    """Compile for maps of at most `MAX_DENSE` keyframes in one submap, with depth and without, of a known camera.
 
     Without recorded poses; images of this size.
     """
     compile_alignment(Camera.guess(width, height))
+    counts = sorted({padded_count(count) for count in range(1, MAX_DENSE + 1)})
     for metric in (True, False):
         warm_up(settings, metric)
-        for keyframes in SMALL:
+        for keyframes in counts:
             compile_global(shape_for(keyframes, settings, metric), settings, metric=metric)

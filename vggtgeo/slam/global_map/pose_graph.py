@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import spsolve
-from scipy.stats import chi2 as chi_square
+from scipy.special import chdtri
 
 from vggtgeo.bundle.intrinsics import Intrinsics
 from vggtgeo.bundle.observations import Observations
@@ -124,7 +124,7 @@ def drift_variance(graph: PoseGraph) -> float:
     distances = odometry.distances(graph.loops, growth=1.0)
     known = distances[np.isfinite(distances)]
     # At least 1: few loops that agree by chance do not make odometry better than it states.
-    return float(max(np.median(known) / chi_square.ppf(0.5, 6), 1.0)) if len(known) else 1.0
+    return float(max(np.median(known) / chdtri(6, 0.5), 1.0)) if len(known) else 1.0
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.models.roles import GeometryResult, InitialGeometry, PointMatches
@@ -28,7 +28,7 @@ from vggtgeo.slam.tracking.pose_acceptance import STEP_GROWTH
 
 EXPLAINED_GATE = 2.0
 """Largest distance of a match from its epipolar line, pixels: four standard deviations of a key point."""
-DECISIVE = float(chi2.isf(1e-6, 1))
+DECISIVE = float(chdtri(1, 1e-6))
 """Statistic above which one of two motions explains more matches than the other beyond chance. Tried on each frame of
 a run, so that a level of 1e-6 is one false decision in a million frames."""
 

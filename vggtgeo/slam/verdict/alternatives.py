@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, ndtri
 
 from vggtgeo.geometry.robust import ClusteredScore, sigma_by_median, two_way_clustered
 from vggtgeo.slam.verdict import corner_adjustment as theta
@@ -90,7 +90,7 @@ def explain(tracks: Tracks) -> Explanation:
 
 def _selected(fit: Fit) -> tuple[Fit, Alternative | None]:
     around = scores(fit)
-    chance = lambda one: float(chi2.isf(SIGNIFICANCE, one.columns.shape[1]))
+    chance = lambda one: float(chdtri(one.columns.shape[1], SIGNIFICANCE))
     one = max(TABLE, key=lambda one: around.gain(one.columns) / around.as_one - chance(one))
     # Before the solution, as if all observations were independent: a linear step is not exact enough for more.
     if around.gain(one.columns) < chance(one):
@@ -149,7 +149,7 @@ def preferred(fit: Fit) -> bool:
     claim = solve(fit.tracks, start_of(fit.tracks), fit.noise, poses_free=False)
     gain = fit.tracks.sums(claim.loss - fit.loss)
     unknowns = 6 * (len(fit.tracks.rows) - 1) + fit.columns.shape[1]
-    return bool(gain.sum() - unknowns > norm.isf(SIGNIFICANCE) * np.sqrt(len(gain)) * gain.std())
+    return bool(gain.sum() - unknowns > -ndtri(SIGNIFICANCE) * np.sqrt(len(gain)) * gain.std())
 
 
 def scores(fit: Fit) -> ClusteredScore:

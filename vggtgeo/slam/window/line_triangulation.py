@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2 as chi_square
+from scipy.special import chdtri
 
 from vggtgeo.geometry import pinhole, rigid
 from vggtgeo.geometry.robust import TINY
@@ -69,7 +69,7 @@ def _triangulated(
     mean, sigma = first / total, 1.0 / np.sqrt(total)
     # Weighted sum of squared residuals about the mean: chi-square with `views - 1` degrees of freedom.
     spread = second - total * mean**2
-    agree = spread < chi_square.ppf(CHANCE, np.maximum(views - 1, 1))
+    agree = spread < chdtri(np.maximum(views - 1, 1), 1 - CHANCE)
     known = (views >= MIN_VIEWS) & agree & (mean > MIN_INVERSE_DEPTH) & (sigma < MAX_SIGMA * mean)
     # One end alone does not give a line in space.
     both = known.all(1, keepdims=True)
