@@ -141,7 +141,9 @@ def _row(label: str, problems: Problems, kernel: Any, solver: Any, graduation: A
     for entries in problems.values():
         errors, iterations = [], []
         for problem, initial, truth in entries:
-            solution = run(eqx.tree_at(lambda p: p.kernel, problem, kernel), initial)
+            matches = {term.name: eqx.tree_at(lambda t: t.kernel, term, kernel) for term in problem.edge_terms}
+            terms = tuple(matches.get(term.name, term) for term in problem.terms)
+            solution = run(problem.with_terms(terms), initial)
             errors.append(_position_error(np.asarray(solution.state.poses.wxyz_xyz), truth))
             iterations.append(int(solution.iterations))
         cells.append(f"{np.median(errors):.1f} ({np.max(errors):.0f}; {np.mean(iterations):.0f} it.)")

@@ -8,7 +8,7 @@ but no linearisation. `iterations` counts all tried steps, as in Ceres. The damp
 Reweighting overestimates the curvature of a robust kernel along a residual, so with many outliers the actual decrease
 is about twice the predicted one and convergence is slow. The full second-order correction (Triggs et al. 1999, section
 4.3) predicts too large a decrease far from the optimum. The applied part of the correction therefore also follows the
-gain ratio (`_next_correction`), and a step that it may have spoilt is repeated with less of it.
+gain ratio (`_next_correction`), and a step that it may have spoilt is repeated without it.
 `benchmarks/robustness.py` compares the three.
 """
 
@@ -135,7 +135,7 @@ class _Try(eqx.Module):
     accepted: Bool[Array, ""]
     stuck: Bool[Array, ""]
     overcorrected: Bool[Array, ""]
-    """Rejected, possibly due to the correction: linearise again with less of it before the damping is raised."""
+    """Rejected, possibly due to the correction: linearise again without it before the damping is raised."""
     finite: Bool[Array, ""]
     """Whether the step is finite."""
 
@@ -318,8 +318,7 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         gain = (energy - new_energy) / jnp.where(predicted > 0, predicted, 1.0)
         # 1e-3 is Ceres' `min_relative_decrease`.
         accepted = jnp.isfinite(new_energy) & (predicted > 0) & (gain > 1e-3)
-        # The correction may be the reason for the rejection: linearise again with less of it before raising the
-        # damping.
+        # The correction may be the reason for the rejection: linearise again without it before raising the damping.
         overcorrected = ~accepted & (state.correction > 0) if not self.fixed_correction else jnp.asarray(False)
         # Nielsen 1999: an accepted step lowers the damping smoothly with the gain, at most to a third; rejections in a
         # row raise it by 2, 4, 8, ..., so that a poor start needs few of them.
@@ -346,7 +345,8 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         )
 
     def _next_correction(self, state: LevenbergMarquardtState, last: _Try) -> Float[Array, ""]:
-        """Return more of the correction where the model predicted well, the same where fairly, else half of it.
+        """Return more of the correction where the model predicted well, the same where fairly, else half of it; none of
+        it after a step that it may have spoilt.
 
         The missing part shrinks to 0.7 of it, so that eight good steps reach 0.94; below a tenth it is left out.
         """
@@ -358,7 +358,9 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         more = jnp.minimum(1 - 0.7 * (1 - state.correction), self.max_correction)
         less = jnp.where(state.correction > 0.1, state.correction / 2, 0.0)
         kept = jnp.where(at_once & (last.gain > 0.5), state.correction, less)
-        return jnp.where(at_once & (last.gain > 0.9), more, kept)
+        judged = jnp.where(at_once & (last.gain > 0.9), more, kept)
+        # Not a part of it: each part takes a linearisation, and the step that follows is often rejected as well.
+        return jnp.where(last.overcorrected, 0.0, judged)
 
     def _terminate(
         self,
