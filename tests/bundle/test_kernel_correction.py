@@ -1,5 +1,6 @@
 """The second-order correction of robust kernels, and the way through wider kernels."""
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +13,7 @@ from arrow_systems import dense_matrix, zero_step
 from jax.flatten_util import ravel_pytree
 from scenes import make_scene
 from vggtgeo.solvers.kernels import AbstractKernel, Barron, Cauchy, GemanMcClure, Huber, Square
-from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt
+from vggtgeo.solvers.levenberg_marquardt import SchurLevenbergMarquardt, _Try
 from vggtgeo.solvers.schur_complement import dense_schur_complement
 
 from vggtgeo.bundle.bundle_adjustment import BundleAdjustment
@@ -88,6 +89,17 @@ def test_the_correction_saves_iterations() -> None:
     assert ends[1].converged
     assert float(ends[1].energy) <= float(ends[0].energy) * (1 + 1e-7)
     assert int(ends[1].iterations) < int(ends[0].iterations)
+
+
+@pytest.mark.parametrize(("accepted", "gain", "expected"), [(True, 0.95, 0.93), (True, 0.1, 0.45), (False, -1.0, 0.0)])
+def test_a_rejected_step_is_repeated_without_the_correction(accepted: bool, gain: float, expected: float) -> None:
+    # Proves how much of it remains after a good, a poor and a spoilt step. Oracle: the rule, by hand.
+    solver, (problem, state, _) = SchurLevenbergMarquardt(), SCENE.pack()
+    begun = solver.init(None, state, BundleAdjustment(problem), {"check_function": False}, None, None, frozenset())
+    before = replace(begun, correction=jnp.asarray(0.9))
+    after, is_it = replace(before, iterations=before.iterations + 1), jnp.asarray
+    last = _Try(state, after, is_it(gain), is_it(accepted), is_it(False), is_it(not accepted), is_it(True))
+    assert float(solver._next_correction(before, last)) == pytest.approx(expected)
 
 
 @eqx.filter_jit
