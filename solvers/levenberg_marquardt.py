@@ -356,11 +356,10 @@ class SchurLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         # succeeded.
         at_once = last.accepted & (last.state.iterations == state.iterations + 1)
         more = jnp.minimum(1 - 0.7 * (1 - state.correction), self.max_correction)
-        less = jnp.where(state.correction > 0.1, state.correction / 2, 0.0)
+        # After a rejection none: each part of it would take a linearisation, for a step that is often rejected as well.
+        less = jnp.where(last.accepted & (state.correction > 0.1), state.correction / 2, 0.0)
         kept = jnp.where(at_once & (last.gain > 0.5), state.correction, less)
-        judged = jnp.where(at_once & (last.gain > 0.9), more, kept)
-        # Not a part of it: each part takes a linearisation, and the step that follows is often rejected as well.
-        return jnp.where(last.overcorrected, 0.0, judged)
+        return jnp.where(at_once & (last.gain > 0.9), more, kept)
 
     def _terminate(
         self,

@@ -97,8 +97,8 @@ def test_a_rejected_step_is_repeated_without_the_correction(accepted: bool, gain
     solver, (problem, state, _) = SchurLevenbergMarquardt(), SCENE.pack()
     begun = solver.init(None, state, BundleAdjustment(problem), {"check_function": False}, None, None, frozenset())
     before = replace(begun, correction=jnp.asarray(0.9))
-    after, is_it = replace(before, iterations=before.iterations + 1), jnp.asarray
-    last = _Try(state, after, is_it(gain), is_it(accepted), is_it(False), is_it(not accepted), is_it(True))
+    after, array = replace(before, iterations=before.iterations + 1), jnp.asarray
+    last = _Try(state, after, array(gain), array(accepted), array(False), array(not accepted), array(True))
     assert float(solver._next_correction(before, last)) == pytest.approx(expected)
 
 

@@ -9,6 +9,7 @@ from scipy.special import chdtri
 
 # `chdtri(degrees, chance)` is what a chi-squared variable exceeds with a chance. `scipy.stats` has plainer names for it
 # and its like, but takes a quarter of a second to import.
+
 TUKEY = 4.685
 """Cut of Tukey's biweight in standard deviations: 95 % efficient under Gaussian noise (Holland and Welsch 1977)."""
 MAD_SIGMA = 1.4826

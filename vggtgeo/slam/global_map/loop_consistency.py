@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtrc, gammaincinv
 
 from vggtgeo.geometry import rigid
 from vggtgeo.slam.sparse_map.factors import MeasuredRelativePose
@@ -76,7 +76,7 @@ def _largest_growth(drifts: Sequence[float], gate: float) -> float:
     # The sum of the distances over the variance is chi-square: its lower quantile gives the upper limit of the
     # variance.
     level = chdtrc(6, gate)
-    return float(max(np.sum(drifts) / chdtri(6 * len(drifts), 1 - level), 1.0))
+    return float(max(np.sum(drifts) / (2 * gammaincinv(3 * len(drifts), level)), 1.0))
 
 
 @dataclass(frozen=True, eq=False)
