@@ -141,8 +141,9 @@ def _row(label: str, problems: Problems, kernel: Any, solver: Any, graduation: A
     for entries in problems.values():
         errors, iterations = [], []
         for problem, initial, truth in entries:
-            matches = {term.name: eqx.tree_at(lambda t: t.kernel, term, kernel) for term in problem.edge_terms}
-            terms = tuple(matches.get(term.name, term) for term in problem.terms)
+            robust = (*problem.edge_terms, *problem.slot_terms)
+            changed = {term.name: eqx.tree_at(lambda t: t.kernel, term, kernel) for term in robust}
+            terms = tuple(changed.get(term.name, term) for term in problem.terms)
             solution = run(problem.with_terms(terms), initial)
             errors.append(_position_error(np.asarray(solution.state.poses.wxyz_xyz), truth))
             iterations.append(int(solution.iterations))
